@@ -1,0 +1,22 @@
+"""What every test may use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture
+def scan_path() -> Callable[[str], Path]:
+    """Return a real scan by file name; the test is skipped only where the folder of scans is absent."""
+
+    def find(name: str) -> Path:
+        if not SHARED_DATA.is_dir():
+            pytest.skip("the folder of sample scans is not beside this checkout")
+        return SHARED_DATA / name
+
+    return find
