@@ -1,0 +1,262 @@
+"""One cloud to bytes and back: the zstd frame around the payload (docs/format.md, Cloud).
+
+Encoding is a pure function of the set of samples. Decoding trusts nothing: what a frame declares is bounded
+before anything is allocated, and only `Corrupt` comes out of a bad one.
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from functools import cache
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+import numpy as np
+import zstandard
+
+from .channels import Channels, channels_of, from_channels, to_channels
+from .cloud import Cloud
+from .errors import Corrupt
+from .lattice import dequantise
+from .octahedral import decode_normals
+from .payload import MAX_SAMPLES, ORIGIN_LIMIT, Layout, Packed, Unpacked, largest_payload, pack_header, parse_layout
+from .points import PointBatch
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from .attributes import Schema
+
+Effort = Literal["default", "best", "fast"]
+Engine = Literal["auto", "numpy", "compiled"]
+
+WINDOW = 16
+"""Previous samples that predict an attribute: 8 cost 0.9 % more bytes; more gain little and decode slower."""
+
+ZSTD_MAGIC = bytes.fromhex("28b52ffd")
+MAX_FRAME_WINDOW = 1 << 30
+"""zstd's own window for payloads of the largest cloud with the widest schema stays below."""
+
+
+class _Codec(Protocol):
+    """What `codec_numpy` and `codec_compiled` both are."""
+
+    def encode(
+        self,
+        lattice: NDArray[np.int64],
+        rows: NDArray[np.uint32],
+        begin: int,
+        end: int,
+        channels: Channels,
+        window: int,
+    ) -> Packed: ...
+
+    def decode(self, payload: bytes, layout: Layout, channels: Channels) -> Unpacked: ...
+
+
+@cache
+def _codec(engine: Engine) -> _Codec:
+    if engine == "compiled" or (engine == "auto" and find_spec("numba")):
+        from . import codec_compiled
+
+        return codec_compiled
+    if engine not in ("auto", "numpy"):
+        raise ValueError(f"engine {engine!r} is none of auto, numpy, compiled")
+    from . import codec_numpy
+
+    return codec_numpy
+
+
+class _Contexts(threading.local):
+    """zstd contexts of one thread: costly to make and not safe to share."""
+
+    def __init__(self) -> None:
+        self.decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_FRAME_WINDOW)
+        self.compressors: dict[Effort, zstandard.ZstdCompressor] = {}
+
+    def compressor(self, effort: Effort) -> zstandard.ZstdCompressor:
+        if effort not in self.compressors:
+            self.compressors[effort] = zstandard.ZstdCompressor(compression_params=_parameters(effort))
+        return self.compressors[effort]
+
+
+_contexts = _Contexts()
+
+
+def _parameters(effort: Effort) -> zstandard.ZstdCompressionParameters:
+    """Return the encoder settings. Matches shorter than 7 bytes cost more than they save in streams of tokens."""
+    if effort == "best":
+        return zstandard.ZstdCompressionParameters.from_level(19, min_match=7, write_checksum=True)
+    strategy = {"default": zstandard.STRATEGY_LAZY2, "fast": zstandard.STRATEGY_LAZY}[effort]
+    return zstandard.ZstdCompressionParameters.from_level(
+        6, min_match=7, strategy=strategy, search_log=2, write_checksum=True
+    )
+
+
+def encode_cloud(
+    lattice: NDArray[np.int64],
+    codes: Mapping[str, NDArray[Any]],
+    schema: Schema,
+    *,
+    effort: Effort = "default",
+    engine: Engine = "auto",
+) -> bytes:
+    """Pack the samples of one node.
+
+    Parameters
+    ----------
+    lattice : ndarray, (k, 3) int64
+        Lattice coordinates; 1 <= k <= 2**20, the cloud's extent below 2**48, any order.
+    codes : mapping of str to ndarray
+        Codes by attribute name: normals (k, 2), colours (k, 3), scalars (k,).
+    schema : Schema
+        The attributes that are written, in that order.
+    effort : {"default", "best", "fast"}
+        What zstd spends. The payload is the same.
+
+    Returns
+    -------
+    bytes
+        A zstd frame. The order of the samples makes no difference to it.
+
+    Raises
+    ------
+    ValueError
+        If arguments are out of these ranges.
+    """
+    return encode_clouds(lattice, codes, np.array([0, len(lattice)]), schema, effort=effort, engine=engine)[0]
+
+
+def encode_clouds(
+    lattice: NDArray[np.int64],
+    codes: Mapping[str, NDArray[Any]],
+    bounds: NDArray[np.int64],
+    schema: Schema,
+    *,
+    effort: Effort = "default",
+    engine: Engine = "auto",
+) -> list[bytes]:
+    """Pack many clouds that stand one after another: cloud `i` is samples ``bounds[i]`` to ``bounds[i + 1]``.
+
+    The same frames as one call of `encode_cloud` each, for less: what numpy does is done once.
+    """
+    channels = channels_of(schema)
+    lattice = np.ascontiguousarray(lattice, np.int64)
+    edges = np.asarray(bounds).tolist()
+    for begin, end in itertools.pairwise(edges):
+        if not 1 <= end - begin <= MAX_SAMPLES or not 0 <= begin < end <= len(lattice):
+            raise ValueError(f"a cloud of samples {begin} to {end} of {len(lattice)}: 1 to {MAX_SAMPLES} are allowed")
+    if len(lattice) and (lattice.min() <= -ORIGIN_LIMIT or lattice.max() >= ORIGIN_LIMIT):
+        raise ValueError("lattice coordinates must stay below 2**52")
+    rows = to_channels(codes, schema, len(lattice))
+    encode = _codec(engine).encode
+    compressor = _contexts.compressor(effort)
+    return [
+        _frame(encode(lattice, rows, begin, end, channels, WINDOW), end - begin, channels, compressor)
+        for begin, end in itertools.pairwise(edges)
+    ]
+
+
+def _frame(packed: Packed, samples: int, channels: Channels, compressor: zstandard.ZstdCompressor) -> bytes:
+    """Compress a payload with a block for each kind of number, so that each has Huffman codes of its own."""
+    if packed.nbits > 16 or packed.shift > 32:
+        raise ValueError(f"a cloud spans 2**{packed.nbits + packed.shift} steps, 2**48 are the most")
+    head = pack_header(packed, samples, WINDOW) + packed.raw.tobytes()
+    stream = compressor.compressobj(size=len(head) + packed.tokens.size)
+    out = [stream.compress(head), stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)]
+    out += [stream.compress(packed.tokens[0].data), stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)]
+    for first, stop in channels.groups:
+        out += [
+            stream.compress(packed.tokens[1 + first : 1 + stop].data),
+            stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK),
+        ]
+    out.append(stream.flush(zstandard.COMPRESSOBJ_FLUSH_FINISH))
+    return b"".join(out)
+
+
+def decode_cloud(frame: bytes, *, samples: int, schema: Schema, engine: Engine = "auto") -> Cloud:
+    """Unpack a cloud.
+
+    Parameters
+    ----------
+    frame : bytes
+        As `encode_cloud` gave it, or anything.
+    samples : int
+        How many samples the node's record promises.
+    schema : Schema
+        The header's attributes.
+    engine : {"auto", "numpy", "compiled"}
+        "auto" takes the compiled kernels if numba is installed. The arrays are the same.
+
+    Raises
+    ------
+    Corrupt
+        If the frame is not a cloud of so many samples. Nothing else is raised, whatever the bytes are.
+    """
+    if not 1 <= samples <= MAX_SAMPLES:
+        raise Corrupt(f"cloud: a record of {samples} samples (1 to {MAX_SAMPLES} are allowed)")
+    channels = channels_of(schema)
+    payload = _payload(frame, largest_payload(samples, channels))
+    layout = parse_layout(payload, samples=samples, channels=channels)
+    unpacked = _codec(engine).decode(payload, layout, channels)
+    if unpacked.largest >> (3 * layout.nbits):
+        raise Corrupt(f"cloud: its positions leave {layout.nbits} bits")
+    codes = from_channels(unpacked.rows, schema)
+    for attribute in schema:
+        if attribute.kind == "normal" and int(codes[attribute.name].max()) == (1 << attribute.bits) - 1:
+            raise Corrupt(f"cloud: a code of {attribute.name} is no normal's")
+    return Cloud(
+        origin=np.array(layout.origin, np.int64),
+        position=unpacked.position,
+        shift=layout.shift,
+        low=unpacked.low,
+        codes=codes,
+    )
+
+
+def _payload(frame: bytes, limit: int) -> bytes:
+    """Inflate one zstd frame of at most `limit` bytes of content."""
+    try:
+        if frame[:4] != ZSTD_MAGIC:
+            raise Corrupt("cloud: it does not start as a zstd frame does")
+        declared = zstandard.get_frame_parameters(frame)
+        size = declared.content_size
+        if size > limit:  # an unknown size is the largest number there is
+            raise Corrupt(f"cloud: the frame declares {size} bytes, at most {limit} can be true")
+        if declared.dict_id or not declared.has_checksum:
+            raise Corrupt("cloud: the frame wants a dictionary or has no checksum")
+        return _contexts.decompressor.decompress(frame, max_output_size=size, allow_extra_data=False)
+    except zstandard.ZstdError as error:
+        raise Corrupt(f"cloud: {error}") from error
+
+
+def cloud_to_points(cloud: Cloud, header: Any) -> PointBatch:
+    """Give the samples of a decoded cloud in model units.
+
+    Parameters
+    ----------
+    cloud : Cloud
+    header : Header
+        Its `origin`, `step`, `attributes` and `constants` are used.
+
+    Returns
+    -------
+    PointBatch
+        Every attribute of the header, constants included.
+    """
+    xyz = dequantise(cloud.lattice(), np.asarray(header.origin, np.float64), header.step)
+    values: dict[str, NDArray[Any]] = {}
+    for attribute in header.attributes:
+        codes = cloud.codes[attribute.name]
+        if attribute.kind == "normal":
+            values[attribute.name] = decode_normals(codes, attribute.bits)
+        else:
+            values[attribute.name] = attribute.decode(codes)
+    for name, value in header.constants.items():
+        constant = np.asarray(value, np.float32 if name == "normal" else None)
+        dtype = np.min_scalar_type(constant.max()) if constant.dtype.kind in "iu" else constant.dtype
+        values[name] = np.tile(constant.astype(dtype), (len(cloud), *(1,) * constant.ndim))
+    return PointBatch(xyz, values)

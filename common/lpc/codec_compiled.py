@@ -1,0 +1,380 @@
+"""The payload of a cloud in compiled kernels; `codec_numpy` is the oracle.
+
+All kernels and their helpers stand in this module: the compiler's cache does not see changes in other files.
+They release the interpreter lock. No kernel checks an index: `payload.parse_layout` has proved them all.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numba import njit
+
+from .payload import Layout, Packed, Unpacked
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from .channels import Channels
+
+PAD = 32
+"""Far samples in front of the first, so that every sample has a full window."""
+FAR = np.float32(-200_000)
+"""Further than any L1 distance of 16-bit coordinates (196,605), and still exact in float32 times 32."""
+DIGIT = 11
+"""Bits sorted per pass: a few passes for a cloud's code, and counts that stay in the first cache."""
+
+# "Nearest" computes with float32 because the compiler widens int32 sums to int64 and then finds no fast
+# minimum. All values are integers below 2**24, so nothing is rounded; "no NaN" lets it vectorise.
+_EXACT_FLOATS = {"nnan", "nsz"}
+
+
+def encode(
+    lattice: NDArray[np.int64], rows: NDArray[np.uint32], begin: int, end: int, channels: Channels, window: int
+) -> Packed:
+    """Pack the samples begin to end; see `codec.encode_cloud`."""
+    rotation, nbits, shift, x, y, z, raw, tokens = _encode(
+        lattice, rows, begin, end, channels.bits, channels.start, window
+    )
+    return Packed(rotation, nbits, shift, (x, y, z), raw, tokens)
+
+
+def decode(payload: bytes, layout: Layout, channels: Channels) -> Unpacked:
+    """Unpack a payload that `parse_layout` found true."""
+    k = layout.samples
+    data = np.frombuffer(payload + bytes(8), np.uint8)
+    position = np.empty((k, 3), np.uint16)
+    low = np.empty((k if layout.shift else 0, 3), np.uint32)
+    rows = np.empty((len(channels), k), np.uint32)
+    largest = _decode(
+        data, layout.starts, layout.tokens, layout.rotation, layout.shift, layout.window,
+        channels.bits, channels.start, position, low, rows,
+    )  # fmt: skip
+    return Unpacked(int(largest), position, low if layout.shift else None, rows)
+
+
+@njit(cache=True, nogil=True)
+def _bit_length(number: Any) -> Any:
+    """Bits of an unsigned number below 2**64."""
+    length = np.int64(0)
+    for step in (32, 16, 8, 4, 2, 1):
+        if number >> np.uint64(step):
+            number >>= np.uint64(step)
+            length += step
+    return length + np.int64(number)
+
+
+@njit(cache=True, nogil=True)
+def _spread(value: Any) -> Any:
+    """16 bits to every third of 48."""
+    value = (value | (value << np.uint64(16))) & np.uint64(0x0000FF0000FF)
+    value = (value | (value << np.uint64(8))) & np.uint64(0x00F00F00F00F)
+    value = (value | (value << np.uint64(4))) & np.uint64(0x0C30C30C30C3)
+    return (value | (value << np.uint64(2))) & np.uint64(0x249249249249)
+
+
+@njit(cache=True, nogil=True)
+def _gather(value: Any) -> Any:
+    """Every third of 48 bits to 16."""
+    value &= np.uint64(0x249249249249)
+    value = (value | (value >> np.uint64(2))) & np.uint64(0x0C30C30C30C3)
+    value = (value | (value >> np.uint64(4))) & np.uint64(0x00F00F00F00F)
+    value = (value | (value >> np.uint64(8))) & np.uint64(0x0000FF0000FF)
+    return (value | (value >> np.uint64(16))) & np.uint64(0xFFFF)
+
+
+@njit(cache=True, nogil=True)
+def _sort(code: Any, order: Any, code_spare: Any, order_spare: Any, bits: int) -> bool:
+    """Radix sort of codes with their sample numbers; True if the result lies in the spare arrays."""
+    k = len(code)
+    swapped = False
+    count = np.empty(1 << DIGIT, np.int64)
+    mask = np.uint64((1 << DIGIT) - 1)
+    for at in range(0, bits, DIGIT):
+        place = np.uint64(at)
+        count[:] = 0
+        for i in range(k):
+            count[(code[i] >> place) & mask] += 1
+        total = 0
+        for digit in range(1 << DIGIT):
+            here = count[digit]
+            count[digit] = total
+            total += here
+        for i in range(k):
+            digit = (code[i] >> place) & mask
+            to = count[digit]
+            count[digit] = to + 1
+            code_spare[to] = code[i]
+            order_spare[to] = order[i]
+        code, code_spare = code_spare, code
+        order, order_spare = order_spare, order
+        swapped = not swapped
+    return swapped
+
+
+@njit(cache=True, nogil=True)
+def _less(lattice: Any, rows: Any, a: int, b: int) -> bool:
+    """Order of samples of one Morton code: full coordinates, then channels."""
+    for axis in range(3):
+        if lattice[a, axis] != lattice[b, axis]:
+            return lattice[a, axis] < lattice[b, axis]
+    for row in range(rows.shape[0]):
+        if rows[row, a] != rows[row, b]:
+            return rows[row, a] < rows[row, b]
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _sort_ties(lattice: Any, rows: Any, order: Any, first: int, stop: int) -> None:
+    """Shell sort of one run of equal codes: short as a rule, a million coincident samples at worst."""
+    gap = 1
+    while gap < (stop - first) // 3:
+        gap = 3 * gap + 1
+    while gap > 0:
+        for i in range(first + gap, stop):
+            moving = order[i]
+            to = i
+            while to - gap >= first and _less(lattice, rows, moving, order[to - gap]):
+                order[to] = order[to - gap]
+                to -= gap
+            order[to] = moving
+        gap //= 3
+
+
+@njit(cache=True, nogil=True)
+def _put(raw: Any, at: int, pending: Any, filled: int, value: Any, width: int) -> Any:
+    """Append `width` bits; returns byte, pending bits and their number (below 8)."""
+    pending |= value << np.uint64(filled)
+    filled += width
+    while filled >= 8:
+        raw[at] = np.uint8(pending & np.uint64(255))
+        at += 1
+        pending >>= np.uint64(8)
+        filled -= 8
+    return at, pending, filled
+
+
+@njit(cache=True, nogil=True)
+def _finish(raw: Any, at: int, pending: Any, filled: int) -> int:
+    """Pad a bit stream to a byte."""
+    if filled:
+        raw[at] = np.uint8(pending)
+        at += 1
+    return at
+
+
+@njit(cache=True, nogil=True)
+def _write(number: Any, tokens: Any, raw: Any, at: int) -> int:
+    """Write a channel of numbers as tokens and one raw stream from byte `at` on; returns its end."""
+    pending = np.uint64(0)
+    filled = 0
+    for i in range(len(number)):
+        value = number[i]
+        if value < 2:
+            tokens[i] = np.uint8(value)
+        else:
+            width = _bit_length(value) - 2
+            tokens[i] = np.uint8(((width + 1) << 1) | np.int64((value >> np.uint64(width)) & np.uint64(1)))
+            value &= (np.uint64(1) << np.uint64(width)) - np.uint64(1)
+            at, pending, filled = _put(raw, at, pending, filled, value, width)
+    return _finish(raw, at, pending, filled)
+
+
+@njit(cache=True, nogil=True, fastmath=_EXACT_FLOATS)
+def _nearest(xs: Any, ys: Any, zs: Any, i: int, window: int) -> Any:
+    """How far back in order the nearest of the `window` samples before sample i stands (L1)."""
+    x, y, z = xs[PAD + i], ys[PAD + i], zs[PAD + i]
+    best = np.float32(3e38)
+    first = PAD + i - window
+    for m in range(window):
+        distance = abs(xs[first + m] - x) + abs(ys[first + m] - y) + abs(zs[first + m] - z)
+        packed = distance * np.float32(32) + np.float32(window - m)
+        best = min(best, packed)
+    return np.int64(best) & 31
+
+
+@njit(cache=True, nogil=True)
+def _predecessors(xs: Any, ys: Any, zs: Any, window: int, before: Any) -> None:
+    """Fill in `_nearest` of all samples; 0: there is none."""
+    k = len(before)
+    if window == 16:  # a constant trip count is twice as fast
+        for i in range(k):
+            before[i] = _nearest(xs, ys, zs, i, 16)
+    else:
+        for i in range(k):
+            before[i] = _nearest(xs, ys, zs, i, window) if window else 0
+    before[0] = 0
+
+
+@njit(cache=True, nogil=True)
+def _encode(lattice: Any, rows: Any, begin: int, end: int, bits: Any, start: Any, window: int) -> Any:
+    k = end - begin
+    corner = lattice[begin].copy()
+    far = lattice[begin].copy()
+    for i in range(begin, end):
+        for axis in range(3):
+            corner[axis] = min(corner[axis], lattice[i, axis])
+            far[axis] = max(far[axis], lattice[i, axis])
+    width = _bit_length(np.uint64(max(far[0] - corner[0], far[1] - corner[1], far[2] - corner[2])))
+    shift = max(0, width - 16)
+    nbits = width - shift
+
+    spread = np.empty((k, 3), np.uint64)
+    for i in range(k):
+        for axis in range(3):
+            spread[i, axis] = _spread(np.uint64((lattice[begin + i, axis] - corner[axis]) >> shift))
+
+    # The rotation that makes the differences shortest: it puts the thin axis in the top bit of every three.
+    code = np.empty(k, np.uint64)
+    order = np.empty(k, np.uint32)
+    code_spare = np.empty(k, np.uint64)
+    order_spare = np.empty(k, np.uint32)
+    best_code = np.empty(k, np.uint64)
+    best_order = np.empty(k, np.uint32)
+    rotation = 0
+    least = np.int64(0)
+    for turn in range(3):
+        a, b, c = turn, (turn + 1) % 3, (turn + 2) % 3
+        for i in range(k):
+            code[i] = spread[i, a] | (spread[i, b] << np.uint64(1)) | (spread[i, c] << np.uint64(2))
+            order[i] = begin + i
+        if _sort(code, order, code_spare, order_spare, 3 * nbits):
+            code, code_spare = code_spare, code
+            order, order_spare = order_spare, order
+        cost = np.int64(0)
+        last = np.uint64(0)
+        for i in range(k):
+            cost += _bit_length(code[i] - last)
+            last = code[i]
+        if turn == 0 or cost < least:
+            least = cost
+            rotation = turn
+            code, best_code = best_code, code
+            order, best_order = best_order, order
+    code = best_code
+    order = best_order
+
+    first = 0
+    for i in range(1, k + 1):
+        if i == k or code[i] != code[first]:
+            if i - first > 1:
+                _sort_ties(lattice, rows, order, first, i)
+            first = i
+
+    raw_bits = 3 * shift + max(3 * nbits - 2, 0)
+    for row in range(len(bits)):
+        raw_bits += max(bits[row] - 2, 0)
+    raw = np.empty((k * raw_bits + 7) // 8 + 2 + len(bits), np.uint8)
+    tokens = np.empty((1 + len(bits), k), np.uint8)
+    at = 0
+    xs, ys, zs = np.empty(PAD + k, np.float32), np.empty(PAD + k, np.float32), np.empty(PAD + k, np.float32)
+    xs[:PAD] = FAR
+    ys[:PAD] = 0
+    zs[:PAD] = 0
+    pending = np.uint64(0)
+    filled = 0
+    low_mask = (np.int64(1) << shift) - 1
+    for i in range(k):
+        sample = order[i]
+        x, y, z = (
+            lattice[sample, 0] - corner[0],
+            lattice[sample, 1] - corner[1],
+            lattice[sample, 2] - corner[2],
+        )
+        xs[PAD + i], ys[PAD + i], zs[PAD + i] = x >> shift, y >> shift, z >> shift
+        if shift:
+            at, pending, filled = _put(raw, at, pending, filled, np.uint64(x & low_mask), shift)
+            at, pending, filled = _put(raw, at, pending, filled, np.uint64(y & low_mask), shift)
+            at, pending, filled = _put(raw, at, pending, filled, np.uint64(z & low_mask), shift)
+    at = _finish(raw, at, pending, filled)
+
+    number = code_spare
+    number[0] = code[0]
+    for i in range(1, k):
+        number[i] = code[i] - code[i - 1]
+    at = _write(number, tokens[0], raw, at)
+
+    if len(bits):
+        before = np.empty(k, np.int64)
+        _predecessors(xs, ys, zs, window, before)
+        value = np.empty(k, np.int64)
+        for row in range(len(bits)):
+            levels = np.int64(1) << bits[row]
+            for i in range(k):
+                value[i] = rows[row, order[i]]
+            for i in range(k):
+                back = before[i]
+                guess = value[i - back] if back else np.int64(start[row])
+                residual = (value[i] - guess) & (levels - 1)
+                signed = 2 * residual if residual < levels >> 1 else 2 * (levels - residual) - 1
+                number[i] = np.uint64(signed)
+            at = _write(number, tokens[1 + row], raw, at)
+    return rotation, nbits, shift, corner[0], corner[1], corner[2], raw[:at], tokens
+
+
+@njit(cache=True, nogil=True)
+def _word(data: Any, bit: Any) -> Any:
+    """At least 57 bits from bit `bit` on."""
+    at = bit >> np.uint64(3)
+    word = np.uint64(0)
+    for byte in range(8):
+        word |= np.uint64(data[at + np.uint64(byte)]) << np.uint64(8 * byte)
+    return word >> (bit & np.uint64(7))
+
+
+@njit(cache=True, nogil=True)
+def _number(data: Any, bit: Any, token: Any) -> Any:
+    """One number from its token and the raw stream; returns the bit after it, too."""
+    if token < 2:
+        return np.uint64(token), bit
+    width = np.uint64((token >> 1) - 1)
+    raw = _word(data, bit) & ((np.uint64(1) << width) - np.uint64(1))
+    return (np.uint64(2 | (token & 1)) << width) | raw, bit + width
+
+
+@njit(cache=True, nogil=True)
+def _decode(
+    data: Any, starts: Any, tokens: int, rotation: int, shift: int, window: int,
+    bits: Any, start: Any, position: Any, low: Any, rows: Any,
+) -> Any:  # fmt: skip
+    k = len(position)
+    if shift:
+        bit = np.uint64(starts[0] * 8)
+        mask = (np.uint64(1) << np.uint64(shift)) - np.uint64(1)
+        for i in range(k):
+            for axis in range(3):
+                low[i, axis] = _word(data, bit) & mask
+                bit += np.uint64(shift)
+
+    xs, ys, zs = np.empty(PAD + k, np.float32), np.empty(PAD + k, np.float32), np.empty(PAD + k, np.float32)
+    xs[:PAD] = FAR
+    ys[:PAD] = 0
+    zs[:PAD] = 0
+    a, b, c = rotation, (rotation + 1) % 3, (rotation + 2) % 3
+    code = np.uint64(0)
+    largest = np.uint64(0)
+    bit = np.uint64(starts[1] * 8)
+    for i in range(k):
+        step, bit = _number(data, bit, data[tokens + i])
+        code += step
+        largest = max(largest, code)
+        x, y, z = _gather(code), _gather(code >> np.uint64(1)), _gather(code >> np.uint64(2))
+        position[i, a], position[i, b], position[i, c] = x, y, z
+        xs[PAD + i], ys[PAD + i], zs[PAD + i] = x, y, z  # L1 does not mind which axis is which
+
+    if len(bits):
+        before = np.empty(k, np.int64)
+        _predecessors(xs, ys, zs, window, before)
+        for row in range(len(bits)):
+            tokens += k
+            bit = np.uint64(starts[2 + row] * 8)
+            levels = np.uint32((np.int64(1) << bits[row]) - 1)
+            value = rows[row]
+            for i in range(k):
+                zigzag, bit = _number(data, bit, data[tokens + i])
+                residual = np.uint32((zigzag >> np.uint64(1)) ^ (np.uint64(0) - (zigzag & np.uint64(1))))
+                back = before[i]
+                guess = value[i - back] if back else np.uint32(start[row])
+                value[i] = np.uint32(np.uint32(guess + residual) & levels)
+    return largest

@@ -1,0 +1,167 @@
+"""The payload of a cloud in plain numpy: the oracle of the compiled codec, and what runs where numba is missing.
+
+Vectorised over the samples. Prediction is additive, ``value = value of j + residual`` modulo a power of two,
+so decoding follows the tree of predecessors by pointer doubling: log2(k) rounds instead of k steps.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .payload import RAW_BITS, TOP_BITS, Layout, Packed, Unpacked
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from .channels import Channels
+
+_SPREAD = ((16, 0x0000FF0000FF), (8, 0x00F00F00F00F), (4, 0x0C30C30C30C3), (2, 0x249249249249))
+_GATHER = ((2, 0x0C30C30C30C3), (4, 0x00F00F00F00F), (8, 0x0000FF0000FF), (16, 0xFFFF))
+"""Shift and mask per round: from 16 bits side by side to every third of 48, and back."""
+
+
+def encode(
+    lattice: NDArray[np.int64], rows: NDArray[np.uint32], begin: int, end: int, channels: Channels, window: int
+) -> Packed:
+    """Pack the samples begin to end; see `codec.encode_cloud`."""
+    points, rows = lattice[begin:end], rows[:, begin:end]
+    corner = points.min(axis=0)
+    local = points - corner
+    width = int(local.max()).bit_length()
+    shift = max(0, width - TOP_BITS)
+    nbits = width - shift
+    top = local >> shift
+
+    rotation = min(range(3), key=lambda turn: _cost(np.sort(_morton(top, turn))))
+    code = _morton(top, rotation)
+    order = np.lexsort((*rows[::-1], *local.T[::-1], code))
+    code, top, local, rows = code[order], top[order], local[order], rows[:, order]
+
+    low_bits = (local & ((1 << shift) - 1)).astype(np.uint64).ravel()
+    streams = [_pack_bits(low_bits, np.full(low_bits.size, shift, np.int64))] if shift else []
+    numbers = [np.diff(code, prepend=np.uint64(0))]
+    before = _nearest(top, window)
+    for row, bits, start in zip(rows.astype(np.int64), channels.bits.tolist(), channels.start.tolist(), strict=True):
+        guess = np.where(before == 0, start, row[np.arange(len(row)) - before])
+        residual = (row - guess) & ((1 << bits) - 1)
+        negative = residual >= 1 << (bits - 1)
+        numbers.append(np.where(negative, 2 * ((1 << bits) - residual) - 1, 2 * residual).astype(np.uint64))
+    tokens = np.empty((len(numbers), len(code)), np.uint8)
+    for stream, number in enumerate(numbers):
+        length = _bit_length(number)
+        raw = np.maximum(length - 2, 0)
+        next_bit = (number >> raw.astype(np.uint64)).astype(np.int64) & 1
+        tokens[stream] = np.where(length < 2, number.astype(np.int64), ((length - 1) << 1) | next_bit)
+        streams.append(_pack_bits(number & ((np.uint64(1) << raw.astype(np.uint64)) - np.uint64(1)), raw))
+    x, y, z = corner.tolist()
+    return Packed(rotation, nbits, shift, (x, y, z), np.concatenate(streams), tokens)
+
+
+def decode(payload: bytes, layout: Layout, channels: Channels) -> Unpacked:
+    """Unpack a payload that `parse_layout` found true."""
+    data = np.frombuffer(payload + bytes(8), np.uint8)
+    k, starts = layout.samples, layout.starts.tolist()
+    tokens = data[layout.tokens : layout.tokens + (1 + len(channels)) * k].reshape(-1, k)
+
+    low = None
+    if layout.shift:
+        width = np.full(3 * k, layout.shift, np.int64)
+        low = _read_bits(data, starts[0], width).astype(np.uint32).reshape(k, 3)
+    code = np.cumsum(_numbers(data, starts[1], tokens[0]), dtype=np.uint64)
+    position = np.empty((k, 3), np.uint16)
+    for slot in range(3):
+        position[:, (layout.rotation + slot) % 3] = _gather(code >> np.uint64(slot))
+
+    rows = np.empty((len(channels), k), np.uint32)
+    if len(channels):
+        residuals = np.zeros((len(channels), k + 1), np.uint32)  # place 0: before the first sample
+        for row in range(len(channels)):
+            number = _numbers(data, starts[2 + row], tokens[1 + row]).astype(np.uint32)
+            residuals[row, 1:] = (number >> np.uint32(1)) ^ (np.uint32(0) - (number & np.uint32(1)))
+        before = _nearest(position, layout.window)
+        jump = np.zeros(k + 1, np.intp)
+        jump[1:] = np.where(before == 0, 0, np.arange(1, k + 1) - before)
+        while jump.any():
+            residuals += residuals[:, jump]
+            jump = jump[jump]
+        modulo = ((np.int64(1) << channels.bits) - 1).astype(np.uint32)
+        rows = (residuals[:, 1:] + channels.start[:, None]) & modulo[:, None]
+    return Unpacked(int(code.max()), position, low, rows)
+
+
+def _cost(code: NDArray[np.uint64]) -> int:
+    """Bits of the differences of sorted codes: what a rotation of the axes is chosen by."""
+    return int(_bit_length(np.diff(code, prepend=np.uint64(0))).sum())
+
+
+def _bit_length(number: NDArray[np.uint64]) -> NDArray[np.int64]:
+    """Bits of numbers below 2**53."""
+    return np.frexp(number.astype(np.float64))[1].astype(np.int64)
+
+
+def _morton(top: NDArray[np.int64], rotation: int) -> NDArray[np.uint64]:
+    """Interleave (n, 3) coordinates below 2**16: bit 3i + s is bit i of axis (rotation + s) mod 3."""
+    code = np.zeros(len(top), np.uint64)
+    for slot in range(3):
+        spread = top[:, (rotation + slot) % 3].astype(np.uint64)
+        for by, mask in _SPREAD:
+            spread = (spread | (spread << np.uint64(by))) & np.uint64(mask)
+        code |= spread << np.uint64(slot)
+    return code
+
+
+def _gather(code: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Every third bit of 48-bit codes, closed up: undoes one axis of `_morton`."""
+    code = code & np.uint64(0x249249249249)
+    for by, mask in _GATHER:
+        code = (code | (code >> np.uint64(by))) & np.uint64(mask)
+    return code
+
+
+def _nearest(top: NDArray[Any], window: int) -> NDArray[np.int64]:
+    """How far back in order the nearest of the previous `window` samples stands (L1); 0: there is none."""
+    k = len(top)
+    if window == 0:
+        return np.zeros(k, np.int64)
+    far = -(1 << 20)  # L1 distances stay below 3 * 2**16
+    padded = np.full((3, window + k), far, np.int32)
+    padded[:, window:] = top.T
+    best = np.full(k, np.iinfo(np.int32).max, np.int32)
+    for back in range(1, window + 1):
+        distance = np.abs(padded[:, window:] - padded[:, window - back : -back])
+        packed = distance[0]
+        packed += distance[1]
+        packed += distance[2]
+        packed <<= 5
+        packed |= back
+        np.minimum(best, packed, out=best)
+    before = (best & 31).astype(np.int64)
+    before[:1] = 0
+    return before
+
+
+def _pack_bits(number: NDArray[np.uint64], width: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Write numbers of `width` bits one after another, least significant bit first, padded to a byte."""
+    end = np.cumsum(width)
+    place = np.arange(end[-1])
+    which = np.searchsorted(end, place, side="right")
+    bit = (number[which] >> (place - (end - width)[which]).astype(np.uint64)) & np.uint64(1)
+    return np.packbits(bit.astype(np.uint8), bitorder="little")
+
+
+def _read_bits(data: NDArray[np.uint8], start: int, width: NDArray[np.int64]) -> NDArray[np.uint64]:
+    """Read numbers of `width` bits, at most 57 each, from byte `start` on."""
+    place = np.cumsum(width) - width
+    words = np.ndarray(len(data) - 7, "<u8", data.data, 0, (1,))  # the 8 bytes at every byte
+    word = words[start + (place >> 3)] >> (place & 7).astype(np.uint64)
+    return word & ((np.uint64(1) << width.astype(np.uint64)) - np.uint64(1))
+
+
+def _numbers(data: NDArray[np.uint8], start: int, tokens: NDArray[np.uint8]) -> NDArray[np.uint64]:
+    """Numbers from their tokens and the raw stream at byte `start`."""
+    width = RAW_BITS[tokens]
+    raw = _read_bits(data, start, width.astype(np.int64))
+    lead = np.where(tokens < 2, tokens, 2 | (tokens & 1)).astype(np.uint64)
+    return (lead << width.astype(np.uint64)) | raw

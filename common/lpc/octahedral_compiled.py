@@ -1,0 +1,53 @@
+"""The search of `octahedral.encode_normals` as a compiled kernel: the same arithmetic, sample by sample."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numba import njit
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+def nearest_codes(normals: NDArray[np.float64], bits: int) -> NDArray[np.uint16]:
+    """Codes (n, 2) of (n, 3) vectors; see `octahedral.encode_normals`."""
+    codes = np.empty((len(normals), 2), np.uint16)
+    _nearest_codes(normals, float((1 << (bits - 1)) - 1), codes)
+    return codes
+
+
+@njit(cache=True, nogil=True)
+def _nearest_codes(normals: Any, half: float, codes: Any) -> None:
+    for i in range(len(normals)):
+        x, y, z = float(normals[i, 0]), float(normals[i, 1]), float(normals[i, 2])
+        largest = max(abs(x), abs(y), abs(z))
+        if not (largest > 0.0 and largest < np.inf) or x != x or y != y or z != z:
+            codes[i, 0] = codes[i, 1] = 0
+            continue
+        x, y, z = x / largest, y / largest, z / largest
+        size = abs(x) + abs(y) + abs(z)
+        u, v = x / size, y / size
+        if z < 0.0:
+            u, v = (
+                (1.0 - abs(y / size)) * (1.0 if x >= 0.0 else -1.0),
+                (1.0 - abs(x / size)) * (1.0 if y >= 0.0 else -1.0),
+            )
+        low_u, low_v = np.floor((u + 1.0) * half), np.floor((v + 1.0) * half)
+        best = -2.0
+        for corner in range(4):
+            a, b = min(low_u + (corner & 1), 2.0 * half), min(low_v + (corner >> 1), 2.0 * half)
+            p, q = a / half - 1.0, b / half - 1.0
+            w = 1.0 - abs(p) - abs(q)
+            if w < 0.0:
+                p, q = (
+                    (1.0 - abs(q)) * (1.0 if p >= 0.0 else -1.0),
+                    (1.0 - abs(p)) * (1.0 if q >= 0.0 else -1.0),
+                )
+            cosine = (p * x + q * y + w * z) / np.sqrt(p * p + q * q + w * w)
+            if cosine > best:
+                best = cosine
+                codes[i, 0], codes[i, 1] = np.uint16(a), np.uint16(b)
+        if codes[i, 0] == 0 and codes[i, 1] == 0:
+            codes[i, 0] = codes[i, 1] = np.uint16(2.0 * half)

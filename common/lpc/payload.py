@@ -1,0 +1,144 @@
+"""The payload of a cloud: its header, its sizes, and every check that makes decoding it safe.
+
+Both decoders index without looking, the compiled one by necessity. `parse_layout` is the one place that
+proves a payload harmless first (docs/format.md, Cloud).
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from .errors import Corrupt
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from .channels import Channels
+
+CODEC = 1
+HEADER = struct.Struct("<BBBBIqqqB7s")
+MAX_SAMPLES = 1 << 20
+MAX_WINDOW = 31
+TOP_BITS = 16
+MAX_SHIFT = 32
+ORIGIN_LIMIT = 1 << 52
+"""Lattice coordinates stay below this, so float64 holds them exactly."""
+
+RAW_BITS = np.array([0, 0] + [(token >> 1) - 1 for token in range(2, 256)], np.uint8)
+"""Raw bits that follow a token."""
+
+
+class Packed(NamedTuple):
+    """What an encoder gives: the parts of a payload.
+
+    `raw` are the padded bit streams, `tokens` is (1 + c, k) uint8: position, then the channels.
+    """
+
+    rotation: int
+    nbits: int
+    shift: int
+    origin: tuple[int, int, int]
+    raw: NDArray[np.uint8]
+    tokens: NDArray[np.uint8]
+
+
+class Unpacked(NamedTuple):
+    """What a decoder gives.
+
+    `largest` is the largest Morton code met, `position` (k, 3) uint16, `low` (k, 3) uint32 or None,
+    `rows` (c, k) uint32.
+    """
+
+    largest: int
+    position: NDArray[np.uint16]
+    low: NDArray[np.uint32] | None
+    rows: NDArray[np.uint32]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """A payload header that was found true, and where the streams lie.
+
+    Parameters
+    ----------
+    samples, rotation, nbits, shift, origin, window
+        As in docs/format.md.
+    starts : ndarray, (2 + c,) int64
+        Byte offsets of the raw streams in the payload: low bits, position, channels.
+    tokens : int
+        Byte offset of the first token.
+    """
+
+    samples: int
+    rotation: int
+    nbits: int
+    shift: int
+    origin: tuple[int, int, int]
+    window: int
+    starts: NDArray[np.int64]
+    tokens: int
+
+
+def pack_header(packed: Packed, samples: int, window: int) -> bytes:
+    """Return the 40 bytes before the raw streams."""
+    return HEADER.pack(CODEC, packed.rotation, packed.nbits, packed.shift, samples, *packed.origin, window, bytes(7))
+
+
+def largest_payload(samples: int, channels: Channels) -> int:
+    """Bytes that no payload of so many samples can exceed."""
+    raw = 3 * MAX_SHIFT + 3 * TOP_BITS - 2 + int(np.maximum(channels.bits - 2, 0).sum())
+    return HEADER.size + 2 + len(channels) + (samples * raw + 7) // 8 + samples * (1 + len(channels))
+
+
+def parse_layout(payload: bytes, *, samples: int, channels: Channels) -> Layout:
+    """Prove that a payload can be decoded without looking.
+
+    Parameters
+    ----------
+    payload : bytes
+    samples : int
+        As the node's record says.
+    channels : Channels
+
+    Returns
+    -------
+    Layout
+        Every stream it names lies inside the payload, and no token asks for more bits than its channel has.
+
+    Raises
+    ------
+    Corrupt
+    """
+    streams = 1 + len(channels)
+    if len(payload) < HEADER.size + streams * samples:
+        raise Corrupt(f"cloud: {len(payload)} bytes cannot hold {samples} samples")
+    codec, rotation, nbits, shift, count, x, y, z, window, reserved = HEADER.unpack_from(payload)
+    if codec != CODEC:
+        raise Corrupt(f"cloud: codec {codec} is unknown")
+    if count != samples:
+        raise Corrupt(f"cloud: it holds {count} samples, its record says {samples}")
+    if rotation > 2 or window > MAX_WINDOW or any(reserved):
+        raise Corrupt(f"cloud: rotation {rotation}, window {window} or reserved bytes {reserved.hex()} out of range")
+    if nbits > TOP_BITS or shift > MAX_SHIFT or (shift and nbits < TOP_BITS):
+        raise Corrupt(f"cloud: {nbits} + {shift} bits a coordinate are not allowed")
+    extent = 1 << (nbits + shift)
+    if not all(corner > -ORIGIN_LIMIT and corner + extent < ORIGIN_LIMIT for corner in (x, y, z)):
+        raise Corrupt("cloud: its corner is outside the lattice")
+
+    tokens = np.frombuffer(payload, np.uint8, offset=len(payload) - streams * samples).reshape(streams, samples)
+    bits = np.concatenate(([3 * nbits], channels.bits))
+    if (tokens.max(axis=1) > np.maximum(2 * bits - 1, 0)).any():
+        raise Corrupt("cloud: a token asks for more bits than its channel has")
+    raw_bits = np.concatenate(([3 * shift * samples], RAW_BITS[tokens].sum(axis=1, dtype=np.int64)))
+    ends = HEADER.size + np.cumsum((raw_bits + 7) >> 3)
+    if ends[-1] + streams * samples != len(payload):
+        raise Corrupt(f"cloud: {len(payload)} bytes, its tokens ask for {ends[-1] + streams * samples}")
+    starts = np.concatenate(([HEADER.size], ends[:-1]))
+    return Layout(
+        samples=samples, rotation=rotation, nbits=nbits, shift=shift, origin=(x, y, z), window=window,
+        starts=starts, tokens=int(ends[-1]),
+    )  # fmt: skip
