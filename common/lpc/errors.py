@@ -7,6 +7,7 @@
     │   ├── NotAModel              the first bytes are no .lpc header
     │   ├── UnsupportedVersion     a newer format than this program reads
     │   └── Corrupt                lengths, counts, checksums or shapes that cannot be true
+    │       └── Truncated          the bytes given end too early; `needed` says how many it takes
     ├── StoreError (OSError)       a model that cannot be reached or read
     │   ├── NotFound               no such file or address
     │   ├── RangesUnsupported      the host ignores Range
@@ -40,6 +41,20 @@ class UnsupportedVersion(FormatError):
 
 class Corrupt(FormatError):
     """A length, count, checksum or shape that cannot be true; the text names the place."""
+
+
+class Truncated(Corrupt):
+    """The bytes given end too early.
+
+    Attributes
+    ----------
+    needed : int
+        Bytes from the start of what was given that are needed to go on.
+    """
+
+    def __init__(self, message: str, needed: int) -> None:
+        super().__init__(message)
+        self.needed = needed
 
 
 class StoreError(LpcError, OSError):

@@ -1,0 +1,1 @@
+"""Slow, obvious counterparts of the real thing, for tests of every room."""
