@@ -105,14 +105,14 @@ def quantise_spheres(
     moved = np.sqrt(((decoded - center) ** 2).sum(axis=1))
     rounding = 4 * np.finfo(np.float64).eps * np.abs(decoded).max(axis=1, initial=0)
     grown = (radius + moved + position_error) * _GROW + rounding
-    rounded: NDArray[np.float32] = grown.astype(np.float32)
-    rounded = np.where(rounded < grown, np.nextafter(rounded, np.float32(np.inf)), rounded)
-    return codes, rounded
+    rounded = grown.astype(np.float32)
+    upwards: NDArray[np.float32] = np.where(rounded < grown, np.nextafter(rounded, np.float32(np.inf)), rounded)
+    return codes, upwards
 
 
 def decode_centers(codes: NDArray[np.uint32], origin: ArrayLike, side: float) -> F8:
     """Centres in model units, (n, 3) float64, from the field `center` of records."""
-    centers: F8 = codes * (side * 2.0**-32) + np.asarray(origin, dtype=np.float64)
+    centers: F8 = codes.astype(np.float64) * (side * 2.0**-32) + np.asarray(origin, dtype=np.float64)
     return centers
 
 

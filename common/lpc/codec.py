@@ -255,8 +255,6 @@ def cloud_to_points(cloud: Cloud, header: Any) -> PointBatch:
             values[attribute.name] = decode_normals(codes, attribute.bits)
         else:
             values[attribute.name] = attribute.decode(codes)
-    for name, value in header.constants.items():
-        constant = np.asarray(value, np.float32 if name == "normal" else None)
-        dtype = np.min_scalar_type(constant.max()) if constant.dtype.kind in "iu" else constant.dtype
-        values[name] = np.tile(constant.astype(dtype), (len(cloud), *(1,) * constant.ndim))
+    for name, constant in header.constants.items():
+        values[name] = constant.fill(len(cloud))
     return PointBatch(xyz, values)

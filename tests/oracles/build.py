@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from lpc.attributes import Attribute, Schema
 from lpc.codec import encode_cloud
 from lpc.header import Header, seal
@@ -20,7 +22,6 @@ from lpc.lattice import position_error_bound, position_step, quantise
 from lpc.octahedral import decode_normals, encode_normals
 from lpc.page import NO_CONE, RECORD, pack_pages
 from lpc.points import PointBatch
-from numpy.typing import NDArray
 
 
 @dataclass(slots=True)

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from lpc.points import PointBatch
 from numpy.typing import NDArray
+
+from lpc.points import PointBatch
 
 
 def sphere(n: int, *, seed: int = 0, radius: float = 1.0, color: bool = False, normals: bool = True) -> PointBatch:
