@@ -122,7 +122,7 @@ class _Timer(NamedTuple):
 
 
 class _NoSockets(selectors.BaseSelector):
-    """A selector that never waits: it asks the loop to jump. It accepts the loop's own wake-up pipe and nothing else."""
+    """A selector that never waits: it asks the loop to jump. It takes the loop's own wake-up pipe and nothing else."""
 
     def __init__(self, jump: Callable[[], None]) -> None:
         self._jump = jump

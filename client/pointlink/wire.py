@@ -123,7 +123,7 @@ class Flow:
     on_data
         Gets the bytes as they arrive at the other end, which says :meth:`consumed` when it has made room for them.
     on_end
-        Called once after the last byte has arrived.
+        Called after the last byte has arrived, and again if a harsher end follows.
     on_room
         Called when bytes have left the sender's buffer, whose length is :attr:`buffered`.
     """
@@ -144,7 +144,7 @@ class Flow:
         self._offered = 0
         self._unread = 0
         self._ending: End | None = None
-        self._ended = False
+        self._ended: End | None = None
         self._dropped = False
 
     @property
@@ -160,7 +160,7 @@ class Flow:
         self._offer()
 
     def end(self, how: End) -> None:
-        """End the flow after the bytes sent so far; of several calls the harshest holds until the end is under way."""
+        """End the flow after the bytes sent so far; of two ends under way the harsher is the last."""
         if self._ending is None or how > self._ending:
             self._ending = how
             self._end_if_empty()
@@ -203,9 +203,9 @@ class Flow:
             self._on_data(data)
 
     def _end_if_empty(self) -> None:
-        if self._ending is not None and not self._buffer and not self._ended:
-            self._ended = True
-            how = self._ending
+        how = self._ending
+        if how is not None and how is not self._ended and not self._buffer:
+            self._ended = how
             self._wire.signal(lambda: self._on_end(how))
 
 

@@ -1,0 +1,366 @@
+"""A throttled TCP front for any server: real sockets, the rate, round-trip time and buffer of a profile.
+
+::
+
+    client ◀──socket──▶ _End ◀── Line (one Link a direction, shared by all connections) ──▶ _End ◀──socket──▶ upstream
+
+The front relays bytes. For http: and https: upstreams it also replaces the Host header of each request, so that
+``pointstream link https://models.example.org`` works with the paths of that server; redirects to absolute addresses
+leave the front. With an https: upstream the client speaks plain HTTP to the front. ``tcp:`` upstreams are relayed
+untouched.
+
+What a connect costs: the kernel accepts at once, so the client's first bytes are held for one round trip. Connecting
+and asking together take as long as on a real link of that round-trip time. Loss and slow start are not modelled, and
+the real way to the upstream adds to the round trip.
+
+Sockets of the loopback swallow megabytes; the front keeps its own small, so that what the client has read is what the
+link has carried.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import ssl
+import struct
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
+from urllib.parse import urlsplit
+
+from lpc.errors import Unavailable
+from pointlink.hosts import HostRewriter
+from pointlink.wire import End, Flow, Line
+
+if TYPE_CHECKING:
+    from types import TracebackType
+
+    from pointlink.profiles import Profile
+
+SMALLEST_BUFFER = 16 * 1024
+LARGEST_BUFFER = 4 * 1024 * 1024
+LOOKAHEAD = 0.2
+"""Seconds of the link that may wait in front of it, in socket and buffer; more than the upstream's round trip."""
+HANDOVER = 0.01
+"""Seconds of the link that may stand behind it, in the socket to the client."""
+CONNECT_SECONDS = 10.0
+_PORTS = {"http": 80, "https": 443}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Upstream:
+    """The server behind the front.
+
+    Parameters
+    ----------
+    scheme
+        ``http``, ``https`` or ``tcp``.
+    host, port
+        Where it listens.
+    path
+        What follows in the address, kept for printing.
+    """
+
+    scheme: str
+    host: str
+    port: int
+    path: str
+
+    @property
+    def authority(self) -> str:
+        """Host, and port where it is not the scheme's own, as in a Host header."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return host if self.port == _PORTS.get(self.scheme) else f"{host}:{self.port}"
+
+
+def parse_upstream(text: str) -> Upstream:
+    """Read ``http://HOST[:PORT]/PATH``, ``https://...``, ``tcp://HOST:PORT`` or ``HOST:PORT`` (http).
+
+    Raises
+    ------
+    ValueError
+        The text is no address; the message is one line for the user.
+    """
+    try:
+        parts = urlsplit(text if "://" in text else f"http://{text}")
+        port = parts.port if parts.port is not None else _PORTS.get(parts.scheme)
+    except ValueError:
+        parts, port = urlsplit(""), None
+    if parts.scheme not in ("http", "https", "tcp") or not parts.hostname or not port:
+        raise ValueError(f"{text!r} is no server address: give http://HOST[:PORT]/, https://HOST/ or tcp://HOST:PORT")
+    path = parts.path + (f"?{parts.query}" if parts.query else "")
+    return Upstream(scheme=parts.scheme, host=parts.hostname, port=port, path=path)
+
+
+class Front:
+    """A front that listens; leave it with :meth:`close` or as an asynchronous context."""
+
+    def __init__(self, upstream: Upstream, profile: Profile, listener: socket.socket) -> None:
+        self.upstream = upstream
+        self.line = Line.open(profile, asyncio.get_running_loop())
+        self._listener = listener
+        self._profile = profile
+        self._server: asyncio.Server | None = None
+        self._ends: set[_End] = set()
+        self._connecting: set[asyncio.Task[None]] = set()
+
+    @property
+    def url(self) -> str:
+        """Address that stands for the upstream's, with its path."""
+        host, port = self._listener.getsockname()[:2]
+        scheme = "tcp" if self.upstream.scheme == "tcp" else "http"
+        return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}{self.upstream.path}"
+
+    async def start(self) -> None:
+        """Accept connections from now on."""
+        self._server = await asyncio.get_running_loop().create_server(self._accept, sock=self._listener)
+
+    async def close(self) -> None:
+        """Stop listening and cut what is open."""
+        if self._server is not None:
+            self._server.close()
+        for task in list(self._connecting):
+            task.cancel()
+        await asyncio.gather(*self._connecting, return_exceptions=True)
+        for end in list(self._ends):
+            end.abort()
+        if self._server is not None:
+            await self._server.wait_closed()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    def _accept(self) -> asyncio.Protocol:
+        buffer = _bytes_in(LOOKAHEAD, self._profile)
+        rewriter = None if self.upstream.scheme == "tcp" else HostRewriter(self.upstream.authority)
+        near, far = _End(self._ends, buffer, rewriter), _End(self._ends, buffer)
+        up = Flow(self.line.up, on_data=far.data_arrived, on_end=far.end_arrived, on_room=near.room_made)
+        down = Flow(self.line.down, on_data=near.data_arrived, on_end=near.end_arrived, on_room=far.room_made)
+        near.attach(out=up, source=down)
+        far.attach(out=down, source=up)
+        far.open_gate()
+
+        def reach() -> None:
+            task = asyncio.get_running_loop().create_task(self._reach(far))
+            self._connecting.add(task)
+            task.add_done_callback(self._connecting.discard)
+
+        self.line.handshake(reach, near.open_gate)
+        return near
+
+    async def _reach(self, far: _End) -> None:
+        upstream = self.upstream
+        secure = ssl.create_default_context() if upstream.scheme == "https" else None
+        try:
+            sock = await _connect(upstream, _bytes_in(LOOKAHEAD, self._profile))
+            await asyncio.get_running_loop().create_connection(
+                lambda: far, sock=sock, ssl=secure, server_hostname=upstream.host if secure else None
+            )
+        except OSError:
+            far.fail()
+
+
+async def check_upstream(upstream: Upstream) -> None:
+    """Connect once and hang up.
+
+    Raises
+    ------
+    Unavailable
+        Nobody listens there.
+    """
+    try:
+        (await _connect(upstream, SMALLEST_BUFFER)).close()
+    except OSError as error:
+        reason = error.strerror or str(error) or f"nothing within {CONNECT_SECONDS:g} s"
+        raise Unavailable(f"cannot connect to {upstream.authority} ({reason}); start that server first") from error
+
+
+async def serve_front(upstream: Upstream, profile: Profile, *, host: str = "127.0.0.1", port: int = 0) -> Front:
+    """Listen on ``host:port`` (0: any free port) and relay each connection to ``upstream`` over a link of that profile.
+
+    Raises
+    ------
+    Unavailable
+        The address cannot be listened on.
+    """
+    listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _bytes_in(LOOKAHEAD, profile))
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _bytes_in(HANDOVER, profile))
+        listener.bind((host, port))
+    except OSError as error:
+        listener.close()
+        raise Unavailable(f"cannot listen on {host}:{port} ({error.strerror}); give another --port") from error
+    front = Front(upstream, profile, listener)
+    await front.start()
+    return front
+
+
+class _End(asyncio.Protocol):
+    """One real socket of a connection: what it reads goes into one flow, what the other flow brings is written.
+
+    The socket comes later than the object and may go earlier; what the line brings before is kept, after is thrown
+    away.
+    """
+
+    def __init__(self, ends: set[_End], buffer: int, rewriter: HostRewriter | None = None) -> None:
+        self._ends = ends
+        self._buffer = buffer
+        self._rewriter = rewriter
+        self._out: Flow
+        self._source: Flow
+        self._transport: asyncio.Transport | None = None
+        self._early = bytearray()
+        self._gate_open = False
+        self._gone = False
+        self._heard_all = False
+        self._told_all = False
+        self._writing_paused = False
+        self._unwritten = 0
+
+    def attach(self, *, out: Flow, source: Flow) -> None:
+        """Join this end to its two flows."""
+        self._out, self._source = out, source
+
+    def open_gate(self) -> None:
+        """Begin to read: the handshake is over."""
+        self._gate_open = True
+        self.room_made()
+
+    def fail(self) -> None:
+        """Say to the other end that there is nobody here."""
+        self._gone = True
+        self._out.end(End.RESET)
+
+    def abort(self) -> None:
+        """Reset the socket."""
+        self._gone = True
+        if self._transport is not None:
+            _reset(self._transport)
+
+    # The line's side.
+
+    def data_arrived(self, data: bytes) -> None:
+        """Write what the line brings."""
+        if self._gone:
+            self._source.consumed(len(data))
+        elif self._transport is None:
+            self._early += data
+        else:
+            self._transport.write(data)
+            self._unwritten += len(data)
+            if not self._writing_paused:
+                self.resume_writing()
+
+    def end_arrived(self, how: End) -> None:
+        """Learn from the line that the other end has stopped."""
+        self._told_all = True
+        if how is End.RESET:
+            self._out.drop()
+            self.abort()
+        elif self._transport is not None:
+            self._pass_end(self._transport)
+
+    def room_made(self) -> None:
+        """Read on when enough has left for the line."""
+        if self._transport is not None and self._gate_open and self._out.buffered <= self._buffer:
+            self._transport.resume_reading()
+
+    # The socket's side.
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Take the socket."""
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        self._ends.add(self)
+        if self._gone:
+            _reset(transport)
+            return
+        transport.set_write_buffer_limits(high=SMALLEST_BUFFER)
+        if not self._gate_open:
+            transport.pause_reading()
+        if self._early:
+            early, self._early = bytes(self._early), bytearray()
+            self.data_arrived(early)
+        if self._told_all:
+            self._pass_end(transport)
+
+    def data_received(self, data: bytes) -> None:
+        """Send what was read over the line."""
+        self._out.send(self._rewriter.feed(data) if self._rewriter else data)
+        if self._out.buffered > self._buffer and self._transport is not None:
+            self._transport.pause_reading()
+
+    def eof_received(self) -> bool:
+        """Pass on that nothing more will be read; keep writing while the line brings something."""
+        self._heard_all = True
+        if self._rewriter:
+            self._out.send(self._rewriter.finish())
+        self._out.end(End.HALF)
+        return not self._told_all and self._transport is not None and self._transport.can_write_eof()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Tell the other end, unless both had ended in order."""
+        self._transport = None
+        self._gone = True
+        self._ends.discard(self)
+        if exc is not None or not (self._heard_all and self._told_all):
+            self._out.end(End.RESET)
+
+    def pause_writing(self) -> None:
+        """Hold the line back: the socket takes no more."""
+        self._writing_paused = True
+
+    def resume_writing(self) -> None:
+        """Let the line bring more."""
+        self._writing_paused = False
+        size, self._unwritten = self._unwritten, 0
+        self._source.consumed(size)
+
+    def _pass_end(self, transport: asyncio.Transport) -> None:
+        if self._heard_all:
+            transport.close()
+        elif transport.can_write_eof():
+            transport.write_eof()
+
+
+def _reset(transport: asyncio.Transport) -> None:
+    sock = transport.get_extra_info("socket")
+    if sock is not None:
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    transport.abort()
+
+
+def _bytes_in(seconds: float, profile: Profile) -> int:
+    """Return what the link carries in so many seconds, within what sockets are asked to hold."""
+    rate = profile.down_rate
+    return LARGEST_BUFFER if rate is None else min(LARGEST_BUFFER, max(SMALLEST_BUFFER, int(rate / 8.0 * seconds)))
+
+
+async def _connect(upstream: Upstream, buffer: int) -> socket.socket:
+    """Connect with a small receive buffer, which must be set before."""
+    loop = asyncio.get_running_loop()
+    last: OSError = OSError(f"{upstream.host} has no address")
+    async with asyncio.timeout(CONNECT_SECONDS):
+        for family, kind, protocol, _, address in await loop.getaddrinfo(
+            upstream.host, upstream.port, type=socket.SOCK_STREAM
+        ):
+            sock = socket.socket(family, kind, protocol)
+            try:
+                sock.setblocking(False)
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer)
+                await loop.sock_connect(sock, address)
+            except OSError as error:
+                sock.close()
+                last = error
+            except BaseException:
+                sock.close()
+                raise
+            else:
+                return sock
+    raise last
