@@ -6,6 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# Fixed seeds, and no clock in the verdict: a busy machine must not turn a test red.
+settings.register_profile("pointstream", derandomize=True, deadline=None)
+settings.load_profile("pointstream")
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
