@@ -1,0 +1,1 @@
+"""Scans in, one .lpc model out."""
