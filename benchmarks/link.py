@@ -15,10 +15,11 @@ import statistics
 import time
 
 import click
-from pointlink.front import Front, Upstream, parse_upstream, serve_front
-from pointlink.profiles import Profile, parse_profile
 from rich.console import Console
 from rich.table import Table
+
+from pointlink.front import Front, Upstream, parse_upstream, precise_loop, serve_front
+from pointlink.profiles import Profile, parse_profile
 
 ECHO, BULK = b"e", b"b"
 
@@ -82,7 +83,12 @@ async def bulk(front: Front, connections: int, seconds: float) -> tuple[float, f
 
 
 async def measure(profile: Profile, seconds: float, table: Table, name: str) -> None:
-    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    serving = set()
+
+    def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        serving.add(asyncio.get_running_loop().create_task(serve(reader, writer)))
+
+    server = await asyncio.start_server(connected, "127.0.0.1", 0)
     upstream = Upstream(scheme="tcp", host="127.0.0.1", port=server.sockets[0].getsockname()[1], path="")
     async with server, await serve_front(upstream, profile) as front:
         echo, first = await round_trips(front)
@@ -112,7 +118,8 @@ async def measure(profile: Profile, seconds: float, table: Table, name: str) -> 
 def main(seconds: float, profiles: tuple[str, ...]) -> None:
     table = Table("link", "what", "asked", "measured", "error", "")
     for name in profiles:
-        asyncio.run(measure(parse_profile(name), seconds, table, name))
+        with asyncio.Runner(loop_factory=precise_loop) as runner:
+            runner.run(measure(parse_profile(name), seconds, table, name))
     Console().print(table)
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from lpc.errors import LpcError
-from pointlink.front import check_upstream, parse_upstream, serve_front
+from pointlink.front import check_upstream, parse_upstream, precise_loop, serve_front
 from pointlink.profiles import parse_profile
 
 if TYPE_CHECKING:
@@ -46,7 +46,8 @@ def link(upstream: Upstream, profile: Profile, host: str, port: int) -> None:
     the same paths work there. A rate is TCP payload bits per second in both directions.
     """
     try:
-        asyncio.run(_serve(upstream, profile, host, port))
+        with asyncio.Runner(loop_factory=precise_loop) as runner:
+            runner.run(_serve(upstream, profile, host, port))
     except LpcError as error:
         click.echo(str(error), err=True)
         sys.exit(1)

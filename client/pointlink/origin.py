@@ -248,7 +248,14 @@ class Origin:
 
 async def serve_origin(origin: Origin, *, host: str = "127.0.0.1", port: int = 0) -> asyncio.Server:
     """Serve on real sockets of the running loop; port 0 takes a free one (``server.sockets[0].getsockname()[1]``)."""
-    return await asyncio.start_server(origin.handle, host, port)
+    serving: set[asyncio.Task[None]] = set()
+
+    def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.get_running_loop().create_task(origin.handle(reader, writer))
+        serving.add(task)
+        task.add_done_callback(serving.discard)
+
+    return await asyncio.start_server(connected, host, port)
 
 
 def select_range(text: str | None, length: int) -> tuple[int, int] | None:

@@ -10,6 +10,7 @@ import struct
 from collections.abc import AsyncIterator, Awaitable, Callable
 
 import pytest
+
 from lpc.errors import Unavailable
 from pointlink.front import Front, Upstream, check_upstream, parse_upstream, serve_front
 from pointlink.origin import Origin, Resource, serve_origin

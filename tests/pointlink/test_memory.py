@@ -6,6 +6,7 @@ import asyncio
 
 import httpx
 import pytest
+
 from pointlink.memory import Network, transport
 from pointlink.origin import Origin, Resource
 from pointlink.profiles import ADSL, NONE, Profile
