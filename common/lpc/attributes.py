@@ -53,9 +53,9 @@ class Attribute:
             raise Corrupt(f"attribute name of {len(self.name)} characters (1 to {MAX_NAME} are allowed)")
         if self.kind not in ("normal", "color", "scalar"):
             raise Corrupt(f"attribute {self.name}: unknown kind {self.kind!r}")
-        top = {"normal": 16, "color": 16, "scalar": 64}[self.kind]
-        if not 1 <= self.bits <= top:
-            raise Corrupt(f"attribute {self.name}: {self.bits} bits (1 to {top} are allowed)")
+        least, most = {"normal": (2, 16), "color": (1, 16), "scalar": (1, 64)}[self.kind]
+        if not least <= self.bits <= most:
+            raise Corrupt(f"attribute {self.name}: {self.bits} bits ({least} to {most} are allowed)")
         if self.scale < 1:
             raise Corrupt(f"attribute {self.name}: scale {self.scale} is not positive")
         try:

@@ -33,12 +33,15 @@ class Channels:
         A channel has ``2**bits`` levels, 1 <= bits <= 32.
     start : ndarray, (c,) uint32
         What predicts a sample that has no predecessor.
+    normals : ndarray, (m, 2) int64
+        For each normal its first row and M = 2**(bits - 1) - 1, the code of the centre.
     groups : tuple of (int, int)
         Half-open runs of channels that share statistics, so that one zstd block serves a run best.
     """
 
     bits: NDArray[np.int64]
     start: NDArray[np.uint32]
+    normals: NDArray[np.int64]
     groups: tuple[tuple[int, int], ...]
 
     def __len__(self) -> int:
@@ -62,15 +65,23 @@ def channels_of(schema: Schema) -> Channels:
     """Channels of a schema; the same object for equal schemas."""
     bits: list[int] = []
     start: list[int] = []
+    normals: list[tuple[int, int]] = []
     groups: list[tuple[int, int]] = []
     for attribute in schema:
         widths, first, runs = _shape(attribute)
         for run in runs:
             end = groups[-1][1] if groups else 0
             groups.append((end, end + run))
+        if attribute.kind == "normal":
+            normals.append((len(bits), first))
         bits += widths
         start += [first] * len(widths)
-    return Channels(bits=np.array(bits, np.int64), start=np.array(start, np.uint32), groups=tuple(groups))
+    return Channels(
+        bits=np.array(bits, np.int64),
+        start=np.array(start, np.uint32),
+        normals=np.array(normals, np.int64).reshape(-1, 2),
+        groups=tuple(groups),
+    )
 
 
 def to_channels(codes: Mapping[str, NDArray[Any]], schema: Schema, samples: int) -> NDArray[np.uint32]:
@@ -91,9 +102,10 @@ def to_channels(codes: Mapping[str, NDArray[Any]], schema: Schema, samples: int)
     Raises
     ------
     ValueError
-        If an attribute is missing or not of that shape.
+        If an attribute is missing or not of that shape, or a code is too large.
     """
-    rows = np.empty((len(channels_of(schema)), samples), np.uint32)
+    channels = channels_of(schema)
+    rows = np.empty((len(channels), samples), np.uint32)
     at = 0
     for attribute in schema:
         values = codes.get(attribute.name)
@@ -114,6 +126,11 @@ def to_channels(codes: Mapping[str, NDArray[Any]], schema: Schema, samples: int)
         else:
             rows[at] = values
             at += 1
+    top = (np.int64(1) << channels.bits) - 1
+    top[channels.normals[:, 0]] -= 1
+    top[channels.normals[:, 0] + 1] -= 1
+    if samples and (rows.max(axis=1) > top).any():
+        raise ValueError("a code is larger than its attribute's bits allow")
     return rows
 
 

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 Effort = Literal["default", "best", "fast"]
 Engine = Literal["auto", "numpy", "compiled"]
 
-WINDOW = 16
-"""Previous samples that predict an attribute: 8 cost 0.9 % more bytes; more gain little and decode slower."""
+WINDOW = 64
+"""Previous samples that predict an attribute: 16 cost 0.8 % more bytes and decode 1.7 times as fast."""
 
 ZSTD_MAGIC = bytes.fromhex("28b52ffd")
 MAX_FRAME_WINDOW = 1 << 30
@@ -55,6 +55,8 @@ class _Codec(Protocol):
     ) -> Packed: ...
 
     def decode(self, payload: bytes, layout: Layout, channels: Channels) -> Unpacked: ...
+
+    def turn_back(self, rows: NDArray[np.uint32], channels: Channels, turn: int) -> None: ...
 
 
 @cache
@@ -155,24 +157,21 @@ def encode_clouds(
     encode = _codec(engine).encode
     compressor = _contexts.compressor(effort)
     return [
-        _frame(encode(lattice, rows, begin, end, channels, WINDOW), end - begin, channels, compressor)
+        _frame(encode(lattice, rows, begin, end, channels, WINDOW), channels, compressor)
         for begin, end in itertools.pairwise(edges)
     ]
 
 
-def _frame(packed: Packed, samples: int, channels: Channels, compressor: zstandard.ZstdCompressor) -> bytes:
+def _frame(packed: Packed, channels: Channels, compressor: zstandard.ZstdCompressor) -> bytes:
     """Compress a payload with a block for each kind of number, so that each has Huffman codes of its own."""
     if packed.nbits > 16 or packed.shift > 32:
         raise ValueError(f"a cloud spans 2**{packed.nbits + packed.shift} steps, 2**48 are the most")
-    head = pack_header(packed, samples, WINDOW) + packed.raw.tobytes()
+    head = pack_header(packed, WINDOW) + packed.raw.tobytes()
     stream = compressor.compressobj(size=len(head) + packed.tokens.size)
-    out = [stream.compress(head), stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)]
-    out += [stream.compress(packed.tokens[0].data), stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)]
-    for first, stop in channels.groups:
-        out += [
-            stream.compress(packed.tokens[1 + first : 1 + stop].data),
-            stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK),
-        ]
+    out = [stream.compress(head)]
+    for first, stop in ((-1, 0), *channels.groups):
+        out.append(stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK))
+        out.append(stream.compress(packed.tokens[1 + first : 1 + stop].data))
     out.append(stream.flush(zstandard.COMPRESSOBJ_FLUSH_FINISH))
     return b"".join(out)
 
@@ -201,19 +200,21 @@ def decode_cloud(frame: bytes, *, samples: int, schema: Schema, engine: Engine =
     channels = channels_of(schema)
     payload = _payload(frame, largest_payload(samples, channels))
     layout = parse_layout(payload, samples=samples, channels=channels)
-    unpacked = _codec(engine).decode(payload, layout, channels)
+    codec = _codec(engine)
+    unpacked = codec.decode(payload, layout, channels)
     if unpacked.largest >> (3 * layout.nbits):
         raise Corrupt(f"cloud: its positions leave {layout.nbits} bits")
-    codes = from_channels(unpacked.rows, schema)
-    for attribute in schema:
-        if attribute.kind == "normal" and int(codes[attribute.name].max()) == (1 << attribute.bits) - 1:
-            raise Corrupt(f"cloud: a code of {attribute.name} is no normal's")
+    for first, centre in channels.normals.tolist():
+        if unpacked.rows[first : first + 2].max() > 2 * centre:
+            raise Corrupt("cloud: a code is no normal's")
+    if layout.turn:
+        codec.turn_back(unpacked.rows, channels, layout.turn)
     return Cloud(
         origin=np.array(layout.origin, np.int64),
         position=unpacked.position,
         shift=layout.shift,
         low=unpacked.low,
-        codes=codes,
+        codes=from_channels(unpacked.rows, schema),
     )
 
 

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
     from .channels import Channels
 
-PAD = 32
+PAD = 64
 """Far samples in front of the first, so that every sample has a full window."""
 FAR = np.float32(-200_000)
-"""Further than any L1 distance of 16-bit coordinates (196,605), and still exact in float32 times 32."""
+"""Further than any L1 distance of 16-bit coordinates (196,605)."""
 DIGIT = 11
 """Bits sorted per pass: a few passes for a cloud's code, and counts that stay in the first cache."""
 
@@ -34,10 +34,10 @@ def encode(
     lattice: NDArray[np.int64], rows: NDArray[np.uint32], begin: int, end: int, channels: Channels, window: int
 ) -> Packed:
     """Pack the samples begin to end; see `codec.encode_cloud`."""
-    rotation, nbits, shift, x, y, z, raw, tokens = _encode(
-        lattice, rows, begin, end, channels.bits, channels.start, window
+    rotation, turn, nbits, shift, x, y, z, raw, tokens = _encode(
+        lattice, rows, begin, end, channels.bits, channels.start, channels.normals, window
     )
-    return Packed(rotation, nbits, shift, (x, y, z), raw, tokens)
+    return Packed(rotation, turn, nbits, shift, (x, y, z), raw, tokens)
 
 
 def decode(payload: bytes, layout: Layout, channels: Channels) -> Unpacked:
@@ -52,6 +52,12 @@ def decode(payload: bytes, layout: Layout, channels: Channels) -> Unpacked:
         channels.bits, channels.start, position, low, rows,
     )  # fmt: skip
     return Unpacked(int(largest), position, low if layout.shift else None, rows)
+
+
+def turn_back(rows: NDArray[np.uint32], channels: Channels, turn: int) -> None:
+    """Undo the turn of the normals, in place."""
+    for first, centre in channels.normals.tolist():
+        _turn_back(rows[first], rows[first + 1], centre, turn)
 
 
 @njit(cache=True, nogil=True)
@@ -189,18 +195,18 @@ def _nearest(xs: Any, ys: Any, zs: Any, i: int, window: int) -> Any:
     first = PAD + i - window
     for m in range(window):
         distance = abs(xs[first + m] - x) + abs(ys[first + m] - y) + abs(zs[first + m] - z)
-        packed = distance * np.float32(32) + np.float32(window - m)
+        packed = distance * np.float32(64) + np.float32(window - 1 - m)
         best = min(best, packed)
-    return np.int64(best) & 31
+    return (np.int64(best) & 63) + 1
 
 
 @njit(cache=True, nogil=True)
 def _predecessors(xs: Any, ys: Any, zs: Any, window: int, before: Any) -> None:
     """Fill in `_nearest` of all samples; 0: there is none."""
     k = len(before)
-    if window == 16:  # a constant trip count is twice as fast
+    if window == 64:  # a constant trip count is twice as fast
         for i in range(k):
-            before[i] = _nearest(xs, ys, zs, i, 16)
+            before[i] = _nearest(xs, ys, zs, i, 64)
     else:
         for i in range(k):
             before[i] = _nearest(xs, ys, zs, i, window) if window else 0
@@ -208,7 +214,96 @@ def _predecessors(xs: Any, ys: Any, zs: Any, window: int, before: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _encode(lattice: Any, rows: Any, begin: int, end: int, bits: Any, start: Any, window: int) -> Any:
+def _residuals(value: Any, before: Any, bits: int, start: int, number: Any) -> None:
+    """Zigzag of the residuals of one channel."""
+    mask = np.uint32((np.int64(1) << bits) - 1)
+    half = np.int64(1) << (bits - 1)
+    for i in range(len(value)):
+        back = before[i]
+        guess = value[i - back] if back else np.uint32(start)
+        residual = np.int64(np.uint32(value[i] - guess) & mask)
+        number[i] = np.uint64(2 * residual if residual < half else 2 * (2 * half - residual) - 1)
+
+
+@njit(cache=True, nogil=True)
+def _unfold(first: Any, second: Any, centre: int) -> Any:
+    """Integer point of the octahedron |x| + |y| + |z| = centre of two codes."""
+    x, y = np.int64(first) - centre, np.int64(second) - centre
+    z = centre - abs(x) - abs(y)
+    if z < 0:
+        x, y = (centre - abs(y)) * (1 if x >= 0 else -1), (centre - abs(x)) * (1 if y >= 0 else -1)
+    return x, y, z
+
+
+@njit(cache=True, nogil=True)
+def _fold(x: int, y: int, z: int, centre: int) -> Any:
+    """Canonical codes of an integer point of the octahedron."""
+    if z < 0:
+        x, y = (centre - abs(y)) * (1 if x >= 0 else -1), (centre - abs(x)) * (1 if y >= 0 else -1)
+    return np.uint32(x + centre), np.uint32(y + centre)
+
+
+@njit(cache=True, nogil=True)
+def _turn(first: Any, second: Any, centre: int, turn: int, into_first: Any, into_second: Any) -> None:
+    """Turn the octahedron so that another of its six corners is the centre of the map; (0, 0) stays."""
+    axis, sign = turn >> 1, -1 if turn & 1 else 1
+    for i in range(len(first)):
+        if first[i] == 0 and second[i] == 0:
+            into_first[i] = into_second[i] = 0
+            continue
+        x, y, z = _unfold(first[i], second[i], centre)
+        if axis == 1:
+            x, y, z = y, z, x
+        elif axis == 2:
+            x, y, z = z, x, y
+        into_first[i], into_second[i] = _fold(x, y, sign * z, centre)
+
+
+@njit(cache=True, nogil=True)
+def _turn_back(first: Any, second: Any, centre: int, turn: int) -> None:
+    """Undo `_turn`, in place."""
+    axis, sign = turn >> 1, -1 if turn & 1 else 1
+    for i in range(len(first)):
+        if first[i] == 0 and second[i] == 0:
+            continue
+        x, y, z = _unfold(first[i], second[i], centre)
+        z *= sign
+        if axis == 1:
+            x, y, z = z, x, y
+        elif axis == 2:
+            x, y, z = y, z, x
+        first[i], second[i] = _fold(x, y, z, centre)
+
+
+@njit(cache=True, nogil=True)
+def _best_turn(rows: Any, before: Any, bits: Any, start: Any, normals: Any) -> int:
+    """Turn the normals in `rows` so that their residuals are shortest; returns the turn."""
+    if len(normals) == 0:
+        return 0
+    k = rows.shape[1]
+    turned = np.empty((2, k), np.uint32)
+    number = np.empty(k, np.uint64)
+    best, least = 0, np.int64(0)
+    for turn in range(6):
+        cost = np.int64(0)
+        for m in range(len(normals)):
+            row = normals[m, 0]
+            _turn(rows[row], rows[row + 1], normals[m, 1], turn, turned[0], turned[1])
+            for half in range(2):
+                _residuals(turned[half], before, bits[row], start[row], number)
+                for i in range(k):
+                    cost += _bit_length(number[i])
+        if turn == 0 or cost < least:
+            best, least = turn, cost
+    for m in range(len(normals)):
+        row = normals[m, 0]
+        _turn(rows[row], rows[row + 1], normals[m, 1], best, turned[0], turned[1])
+        rows[row], rows[row + 1] = turned[0], turned[1]
+    return best
+
+
+@njit(cache=True, nogil=True)
+def _encode(lattice: Any, rows: Any, begin: int, end: int, bits: Any, start: Any, normals: Any, window: int) -> Any:
     k = end - begin
     corner = lattice[begin].copy()
     far = lattice[begin].copy()
@@ -295,22 +390,19 @@ def _encode(lattice: Any, rows: Any, begin: int, end: int, bits: Any, start: Any
         number[i] = code[i] - code[i - 1]
     at = _write(number, tokens[0], raw, at)
 
+    turn = 0
     if len(bits):
         before = np.empty(k, np.int64)
         _predecessors(xs, ys, zs, window, before)
-        value = np.empty(k, np.int64)
+        sorted_rows = np.empty((len(bits), k), np.uint32)
         for row in range(len(bits)):
-            levels = np.int64(1) << bits[row]
             for i in range(k):
-                value[i] = rows[row, order[i]]
-            for i in range(k):
-                back = before[i]
-                guess = value[i - back] if back else np.int64(start[row])
-                residual = (value[i] - guess) & (levels - 1)
-                signed = 2 * residual if residual < levels >> 1 else 2 * (levels - residual) - 1
-                number[i] = np.uint64(signed)
+                sorted_rows[row, i] = rows[row, order[i]]
+        turn = _best_turn(sorted_rows, before, bits, start, normals)
+        for row in range(len(bits)):
+            _residuals(sorted_rows[row], before, bits[row], start[row], number)
             at = _write(number, tokens[1 + row], raw, at)
-    return rotation, nbits, shift, corner[0], corner[1], corner[2], raw[:at], tokens
+    return rotation, turn, nbits, shift, corner[0], corner[1], corner[2], raw[:at], tokens
 
 
 @njit(cache=True, nogil=True)

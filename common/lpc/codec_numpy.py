@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .payload import RAW_BITS, TOP_BITS, Layout, Packed, Unpacked
+from .octahedral import fold_codes, unfold_codes
+from .payload import RAW_BITS, TOP_BITS, TURNS, Layout, Packed, Unpacked
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -43,11 +44,12 @@ def encode(
     streams = [_pack_bits(low_bits, np.full(low_bits.size, shift, np.int64))] if shift else []
     numbers = [np.diff(code, prepend=np.uint64(0))]
     before = _nearest(top, window)
-    for row, bits, start in zip(rows.astype(np.int64), channels.bits.tolist(), channels.start.tolist(), strict=True):
-        guess = np.where(before == 0, start, row[np.arange(len(row)) - before])
-        residual = (row - guess) & ((1 << bits) - 1)
-        negative = residual >= 1 << (bits - 1)
-        numbers.append(np.where(negative, 2 * ((1 << bits) - residual) - 1, 2 * residual).astype(np.uint64))
+    turned = [_turn(rows, channels, turn) for turn in range(TURNS if len(channels.normals) else 1)]
+    normal_rows = (channels.normals[:, :1] + (0, 1)).ravel()
+    turn = min(range(len(turned)), key=lambda t: sum(
+        int(_bit_length(_zigzag(turned[t][row], before, channels, row)).sum()) for row in normal_rows.tolist()
+    ))  # fmt: skip
+    numbers += [_zigzag(turned[turn][row], before, channels, row) for row in range(len(channels))]
     tokens = np.empty((len(numbers), len(code)), np.uint8)
     for stream, number in enumerate(numbers):
         length = _bit_length(number)
@@ -56,7 +58,7 @@ def encode(
         tokens[stream] = np.where(length < 2, number.astype(np.int64), ((length - 1) << 1) | next_bit)
         streams.append(_pack_bits(number & ((np.uint64(1) << raw.astype(np.uint64)) - np.uint64(1)), raw))
     x, y, z = corner.tolist()
-    return Packed(rotation, nbits, shift, (x, y, z), np.concatenate(streams), tokens)
+    return Packed(rotation, turn, nbits, shift, (x, y, z), np.concatenate(streams), tokens)
 
 
 def decode(payload: bytes, layout: Layout, channels: Channels) -> Unpacked:
@@ -89,6 +91,38 @@ def decode(payload: bytes, layout: Layout, channels: Channels) -> Unpacked:
         modulo = ((np.int64(1) << channels.bits) - 1).astype(np.uint32)
         rows = (residuals[:, 1:] + channels.start[:, None]) & modulo[:, None]
     return Unpacked(int(code.max()), position, low, rows)
+
+
+def turn_back(rows: NDArray[np.uint32], channels: Channels, turn: int) -> None:
+    """Undo the turn of the normals, in place."""
+    axis, sign = turn >> 1, -1 if turn & 1 else 1
+    for first, centre in channels.normals.tolist():
+        stored = unfold_codes(rows[first : first + 2], centre)
+        points = np.empty_like(stored)
+        points[axis], points[(axis + 1) % 3], points[(axis + 2) % 3] = stored[0], stored[1], sign * stored[2]
+        none = (rows[first : first + 2] == 0).all(axis=0)
+        rows[first : first + 2] = np.where(none, 0, fold_codes(points, centre))
+
+
+def _turn(rows: NDArray[np.uint32], channels: Channels, turn: int) -> NDArray[np.uint32]:
+    """Turn the octahedron so that another of its six corners is the centre of the map; (0, 0) stays."""
+    axis, sign = turn >> 1, -1 if turn & 1 else 1
+    turned = rows.copy()
+    for first, centre in channels.normals.tolist():
+        points = unfold_codes(rows[first : first + 2], centre)
+        stored = np.stack([points[axis], points[(axis + 1) % 3], sign * points[(axis + 2) % 3]])
+        none = (rows[first : first + 2] == 0).all(axis=0)
+        turned[first : first + 2] = np.where(none, 0, fold_codes(stored, centre))
+    return turned
+
+
+def _zigzag(row: NDArray[np.uint32], before: NDArray[np.int64], channels: Channels, at: int) -> NDArray[np.uint64]:
+    """Residuals of channel `at` as unsigned numbers, small ones first."""
+    levels = 1 << int(channels.bits[at])
+    value = row.astype(np.int64)
+    guess = np.where(before == 0, int(channels.start[at]), value[np.arange(len(value)) - before])
+    residual = (value - guess) & (levels - 1)
+    return np.where(residual >= levels >> 1, 2 * (levels - residual) - 1, 2 * residual).astype(np.uint64)
 
 
 def _cost(code: NDArray[np.uint64]) -> int:
@@ -134,10 +168,10 @@ def _nearest(top: NDArray[Any], window: int) -> NDArray[np.int64]:
         packed = distance[0]
         packed += distance[1]
         packed += distance[2]
-        packed <<= 5
-        packed |= back
+        packed <<= 6
+        packed |= back - 1
         np.minimum(best, packed, out=best)
-    before = (best & 31).astype(np.int64)
+    before = (best & 63).astype(np.int64) + 1
     before[:1] = 0
     return before
 

@@ -71,7 +71,8 @@ def _nearest_codes(normals: NDArray[np.float64], bits: int) -> NDArray[np.float6
         better = cosine > best
         best[better] = cosine[better]
         codes[better, 0], codes[better, 1] = a[better], b[better]
-    codes[(codes == 0.0).all(axis=1)] = 2.0 * half  # -z again, from another corner of the map
+    edge = (codes == 0.0) | (codes == 2.0 * half)  # where two codes or four mean one direction
+    codes = np.where(edge[:, ::-1], np.maximum(codes, 2.0 * half - codes), codes)
     codes[~real] = 0.0
     return codes
 
@@ -85,6 +86,24 @@ def decode_normals(codes: NDArray[Any], bits: int = 8) -> NDArray[np.float32]:
     normals /= np.sqrt(p * p + q * q + w * w)[:, None]
     normals[(codes == 0).all(axis=1)] = 0.0
     return normals
+
+
+def unfold_codes(codes: NDArray[Any], centre: int) -> NDArray[np.int32]:
+    """Integer points (3, n) with ``|x| + |y| + |z| = centre`` of codes (2, n)."""
+    u, v = codes.astype(np.int32) - centre
+    w = centre - np.abs(u) - np.abs(v)
+    below = w < 0
+    folded = (centre - np.abs(v)) * _sign(u), (centre - np.abs(u)) * _sign(v)
+    return np.stack([np.where(below, folded[0], u), np.where(below, folded[1], v), w])
+
+
+def fold_codes(points: NDArray[np.int32], centre: int) -> NDArray[np.int32]:
+    """Codes (2, n) of integer points (3, n): of the two or four that mean one direction, the canonical one."""
+    x, y, z = points
+    below = z < 0
+    u = np.where(below, (centre - np.abs(y)) * _sign(x), x)
+    v = np.where(below, (centre - np.abs(x)) * _sign(y), y)
+    return np.stack([u, v]) + centre
 
 
 def max_error_degrees(bits: int) -> float:

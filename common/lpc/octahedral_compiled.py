@@ -49,5 +49,8 @@ def _nearest_codes(normals: Any, half: float, codes: Any) -> None:
             if cosine > best:
                 best = cosine
                 codes[i, 0], codes[i, 1] = np.uint16(a), np.uint16(b)
-        if codes[i, 0] == 0 and codes[i, 1] == 0:
-            codes[i, 0] = codes[i, 1] = np.uint16(2.0 * half)
+        a, b = float(codes[i, 0]), float(codes[i, 1])
+        if b in (0.0, 2.0 * half):
+            codes[i, 0] = np.uint16(max(a, 2.0 * half - a))
+        if a in (0.0, 2.0 * half):
+            codes[i, 1] = np.uint16(max(b, 2.0 * half - b))

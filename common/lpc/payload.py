@@ -20,9 +20,11 @@ if TYPE_CHECKING:
     from .channels import Channels
 
 CODEC = 1
-HEADER = struct.Struct("<BBBBIqqqB7s")
+HEADER = struct.Struct("<BBBBBBBB")
 MAX_SAMPLES = 1 << 20
-MAX_WINDOW = 31
+MAX_WINDOW = 64
+MAX_CORNER_BYTES = 7
+TURNS = 6
 TOP_BITS = 16
 MAX_SHIFT = 32
 ORIGIN_LIMIT = 1 << 52
@@ -39,6 +41,7 @@ class Packed(NamedTuple):
     """
 
     rotation: int
+    turn: int
     nbits: int
     shift: int
     origin: tuple[int, int, int]
@@ -50,7 +53,7 @@ class Unpacked(NamedTuple):
     """What a decoder gives.
 
     `largest` is the largest Morton code met, `position` (k, 3) uint16, `low` (k, 3) uint32 or None,
-    `rows` (c, k) uint32.
+    `rows` (c, k) uint32, normals still turned.
     """
 
     largest: int
@@ -65,7 +68,7 @@ class Layout:
 
     Parameters
     ----------
-    samples, rotation, nbits, shift, origin, window
+    samples, rotation, turn, nbits, shift, origin, window
         As in docs/format.md.
     starts : ndarray, (2 + c,) int64
         Byte offsets of the raw streams in the payload: low bits, position, channels.
@@ -75,6 +78,7 @@ class Layout:
 
     samples: int
     rotation: int
+    turn: int
     nbits: int
     shift: int
     origin: tuple[int, int, int]
@@ -83,15 +87,24 @@ class Layout:
     tokens: int
 
 
-def pack_header(packed: Packed, samples: int, window: int) -> bytes:
-    """Return the 40 bytes before the raw streams."""
-    return HEADER.pack(CODEC, packed.rotation, packed.nbits, packed.shift, samples, *packed.origin, window, bytes(7))
+def pack_header(packed: Packed, window: int) -> bytes:
+    """Return the bytes before the raw streams."""
+    corner_bytes = max((corner ^ (corner >> 63)).bit_length() // 8 + 1 for corner in packed.origin)
+    head = HEADER.pack(CODEC, packed.rotation, packed.turn, packed.nbits, packed.shift, window, corner_bytes, 0)
+    return head + b"".join(corner.to_bytes(corner_bytes, "little", signed=True) for corner in packed.origin)
 
 
 def largest_payload(samples: int, channels: Channels) -> int:
     """Bytes that no payload of so many samples can exceed."""
     raw = 3 * MAX_SHIFT + 3 * TOP_BITS - 2 + int(np.maximum(channels.bits - 2, 0).sum())
-    return HEADER.size + 2 + len(channels) + (samples * raw + 7) // 8 + samples * (1 + len(channels))
+    return (
+        HEADER.size
+        + 3 * MAX_CORNER_BYTES
+        + 2
+        + len(channels)
+        + (samples * raw + 7) // 8
+        + samples * (1 + len(channels))
+    )
 
 
 def parse_layout(payload: bytes, *, samples: int, channels: Channels) -> Layout:
@@ -116,15 +129,20 @@ def parse_layout(payload: bytes, *, samples: int, channels: Channels) -> Layout:
     streams = 1 + len(channels)
     if len(payload) < HEADER.size + streams * samples:
         raise Corrupt(f"cloud: {len(payload)} bytes cannot hold {samples} samples")
-    codec, rotation, nbits, shift, count, x, y, z, window, reserved = HEADER.unpack_from(payload)
+    codec, rotation, turn, nbits, shift, window, corner_bytes, reserved = HEADER.unpack_from(payload)
     if codec != CODEC:
         raise Corrupt(f"cloud: codec {codec} is unknown")
-    if count != samples:
-        raise Corrupt(f"cloud: it holds {count} samples, its record says {samples}")
-    if rotation > 2 or window > MAX_WINDOW or any(reserved):
-        raise Corrupt(f"cloud: rotation {rotation}, window {window} or reserved bytes {reserved.hex()} out of range")
+    if rotation > 2 or turn >= TURNS or window > MAX_WINDOW or corner_bytes > MAX_CORNER_BYTES or reserved:
+        raise Corrupt(f"cloud: its header {payload[: HEADER.size].hex()} is out of range")
     if nbits > TOP_BITS or shift > MAX_SHIFT or (shift and nbits < TOP_BITS):
         raise Corrupt(f"cloud: {nbits} + {shift} bits a coordinate are not allowed")
+    head = HEADER.size + 3 * corner_bytes
+    if len(payload) < head + streams * samples:
+        raise Corrupt(f"cloud: {len(payload)} bytes cannot hold {samples} samples")
+    x, y, z = (
+        int.from_bytes(payload[at : at + corner_bytes], "little", signed=True)
+        for at in (HEADER.size, HEADER.size + corner_bytes, HEADER.size + 2 * corner_bytes)
+    )
     extent = 1 << (nbits + shift)
     if not all(corner > -ORIGIN_LIMIT and corner + extent < ORIGIN_LIMIT for corner in (x, y, z)):
         raise Corrupt("cloud: its corner is outside the lattice")
@@ -134,11 +152,11 @@ def parse_layout(payload: bytes, *, samples: int, channels: Channels) -> Layout:
     if (tokens.max(axis=1) > np.maximum(2 * bits - 1, 0)).any():
         raise Corrupt("cloud: a token asks for more bits than its channel has")
     raw_bits = np.concatenate(([3 * shift * samples], RAW_BITS[tokens].sum(axis=1, dtype=np.int64)))
-    ends = HEADER.size + np.cumsum((raw_bits + 7) >> 3)
+    ends = head + np.cumsum((raw_bits + 7) >> 3)
     if ends[-1] + streams * samples != len(payload):
         raise Corrupt(f"cloud: {len(payload)} bytes, its tokens ask for {ends[-1] + streams * samples}")
-    starts = np.concatenate(([HEADER.size], ends[:-1]))
+    starts = np.concatenate(([head], ends[:-1]))
     return Layout(
-        samples=samples, rotation=rotation, nbits=nbits, shift=shift, origin=(x, y, z), window=window,
+        samples=samples, rotation=rotation, turn=turn, nbits=nbits, shift=shift, origin=(x, y, z), window=window,
         starts=starts, tokens=int(ends[-1]),
     )  # fmt: skip
