@@ -6,6 +6,7 @@ import laspy
 import numpy as np
 import pyproj
 import pytest
+
 from lpc.errors import ScanError
 from lpc.points import PointBatch
 from pointbuild.readers import open_scan

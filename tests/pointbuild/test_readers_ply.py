@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from plyfile import PlyData, PlyElement
+
 from lpc.errors import ScanError
 from lpc.points import PointBatch
-from plyfile import PlyData, PlyElement
 from pointbuild.readers import finite, open_scan
 
 ENCODINGS = {"ascii": {"text": True}, "little": {"byte_order": "<"}, "big": {"byte_order": ">"}}

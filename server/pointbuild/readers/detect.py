@@ -142,7 +142,7 @@ def _translated(error: BaseException, path: Path, kind: str) -> BaseException:
         return ScanError(f"{path}: reading {kind} needs {error.name}; install pointstream[server]")
     # lazrs is written in Rust, whose panics come as a BaseException of their own.
     if isinstance(error, Exception) or type(error).__name__ == "PanicException":
-        said = " ".join(str(error).split())[:160] or type(error).__name__
+        said = (str(error).strip().splitlines() or [type(error).__name__])[0][:160]
         return ScanError(f"{path}: cannot be read as {kind} ({said}); the file is damaged, copy it again")
     return error
 

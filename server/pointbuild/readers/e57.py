@@ -43,7 +43,6 @@ class E57Scan:
     """
 
     def __init__(self, path: Path, options: ReadOptions) -> None:
-        left_out: dict[str, str] = {}
         fields: dict[str, list[Any]] = {}
         with closing(pye57.E57(str(path))) as file:
             headers = [file.get_header(index) for index in range(file.scan_count)]
@@ -54,6 +53,21 @@ class E57Scan:
             self._counts = [int(header.point_count) for header in headers]
             crs = _crs(file)
             self._color = _color_range(headers, fields) if _COLOR[0] in fields else (0.0, 255.0)
+            attributes, left_out = self._attributes(fields, options)
+        self.info = ScanInfo(
+            path=path,
+            samples_hint=sum(self._counts),
+            crs=crs,
+            attributes=attributes,
+            raw_bytes=path.stat().st_size,
+            left_out=left_out,
+        )
+
+    def _attributes(
+        self, fields: dict[str, list[Any]], options: ReadOptions
+    ) -> tuple[dict[str, np.dtype[Any]], dict[str, str]]:
+        """Decide what becomes of the fields, whose nodes are by name; also says what is left out and why."""
+        left_out: dict[str, str] = {}
         attributes: dict[str, np.dtype[Any]] = {}
         if options.file_normals and all(name in fields for name in _NORMAL):
             attributes["normal"] = np.dtype(np.float32)
@@ -69,14 +83,7 @@ class E57Scan:
                 left_out[attribute] = "not asked for (--attributes all)"
             else:
                 attributes[attribute] = _dtype(nodes)
-        self.info = ScanInfo(
-            path=path,
-            samples_hint=sum(self._counts),
-            crs=crs,
-            attributes=attributes,
-            raw_bytes=path.stat().st_size,
-            left_out=left_out,
-        )
+        return attributes, left_out
 
     def batches(self, size: int) -> Iterator[PointBatch]:
         """Read the samples of all scans; see `Scan.batches`."""
