@@ -114,6 +114,8 @@ class Goodput:
     options: GoodputOptions = field(default_factory=GoodputOptions)
     received_bytes: int = 0
     """Body bytes since the start, useful or not."""
+    requests: int = 0
+    """Requests since the start, retries included."""
     busy_seconds: float = 0.0
     """Busy seconds that entered the averages."""
     _transfers: list[Transfer] = field(default_factory=list)
@@ -131,6 +133,7 @@ class Goodput:
         """Note that a request for `expected` body bytes was made."""
         transfer = Transfer(sent=now, remaining=expected, ahead=self.outstanding)
         self._transfers.append(transfer)
+        self.requests += 1
         return transfer
 
     def sent(self, transfer: Transfer, now: float) -> None:

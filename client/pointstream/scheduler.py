@@ -2,8 +2,8 @@
 
 Theory
 ------
-LPC 4: "the request queue is traversed in order of priority at the end of the frame, issuing only as many requests as those
-allowed by the estimated network bandwidth, and forgetting the rest". Bytes, not requests, are what a link carries:
+LPC 4: "the request queue is traversed in order of priority at the end of the frame, issuing only as many requests as
+those allowed by the estimated network bandwidth, and forgetting the rest". A link carries bytes, not requests:
 
 1. *Wants are forgotten.* `offer` replaces all wants that are not in flight. Nothing queues here across a turn of the
    camera.
@@ -23,8 +23,8 @@ allowed by the estimated network bandwidth, and forgetting the rest". Bytes, not
    spent twice. `gain` above 1 lets the estimate grow when the link does.
 6. *Slow start.* Before the first measurement there is no bucket, and the window grows by every byte that lands: it
    doubles each round trip from one that suits the prior.
-7. *A local file has no link*: a constant window, counted until the clouds are decoded, bounds the work in flight
-   instead.
+7. *A local file has no link*: a constant window bounds what is in flight, and the layer stops asking while too much
+   waits to be decoded.
 
 Everything is an argument: wants, time, and the state of the link. `offer` and `issue` return and do no I/O.
 """
@@ -214,13 +214,9 @@ class Scheduler:
             self._keys[item.key] = request
 
     def landed(self, request: Request, nbytes: int) -> None:
-        """Note that more of a request has arrived."""
-        request.landed = min(request.range.size, request.landed + nbytes)
-        self._grown += nbytes
-
-    def delivered(self, key: int) -> None:
-        """Note that one object has arrived and been taken, so that it may be wanted again."""
-        self._keys.pop(key, None)
+        """Note that more of a request has arrived (or, below 0, that a reply started again)."""
+        request.landed = min(request.range.size, max(0, request.landed + nbytes))
+        self._grown += max(0, nbytes)
 
     def ended(self, request: Request) -> None:
         """Note that a request is over, whole or not; what it did not deliver may be wanted again."""

@@ -138,7 +138,6 @@ class Client:
                 item = waiting.pop(0)
                 self.here[item.key] = self.link.now
                 self.payload += item.stop - item.start
-                self.scheduler.delivered(item.key)
                 if not last:
                     self.issue()
             if last:
