@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 # Fixed seeds, and no clock in the verdict: a busy machine must not turn a test red.
 settings.register_profile("pointstream", derandomize=True, deadline=None)

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from lpc.attributes import Attribute
-from lpc.header import Constant, Header, seal
+from lpc.constants import Constant
+from lpc.header import Header, seal
 from lpc.page import NO_CONE, RECORD, child_counts, pack_pages
 from lpc.ranges import ByteRange
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 finite = st.floats(-1e6, 1e6, allow_nan=False)
 lengths = st.floats(1e-6, 1e6, allow_nan=False)

@@ -12,15 +12,17 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from lpc.errors import LpcError
 
 from . import __version__
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
 
 GROUP = "pointstream.commands"
 

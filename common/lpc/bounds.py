@@ -128,20 +128,20 @@ def normal_cones(normals: NDArray[np.floating], starts: ArrayLike) -> tuple[F8, 
     A cloud with a zero normal has no cone.
     """
     starts = np.asarray(starts)
-    first = starts[:-1]
-    wide = normals.astype(np.float64)
-    length = np.sqrt(np.einsum("ij,ij->i", wide, wide))
+    first, counts = starts[:-1], np.diff(starts)
+    wide = normals.T.astype(np.float64, order="C")  # reductions over rows of (3, m) are several times quicker
+    length = np.sqrt((wide**2).sum(axis=0))
     whole = np.minimum.reduceat(length, first) > 0
-    wide /= np.where(length > 0, length, 1)[:, None]
-    axis = np.add.reduceat(wide, first, axis=0)
-    size = np.sqrt(np.einsum("ij,ij->i", axis, axis))
-    whole &= size > 1e-9 * np.diff(starts)
-    axis = np.where(whole[:, None], axis / np.where(whole, size, 1)[:, None], [0.0, 0.0, 1.0])
-    apart = wide - np.repeat(axis, np.diff(starts), axis=0)
+    wide /= np.where(length > 0, length, 1)
+    axis = np.add.reduceat(wide, first, axis=1)
+    size = np.sqrt((axis**2).sum(axis=0))
+    whole &= size > 1e-9 * counts
+    axis = np.where(whole, axis / np.where(whole, size, 1), [[0.0], [0.0], [1.0]])
     # The chord keeps its digits for narrow cones, where arccos of the dot product loses half of them.
-    chord = np.sqrt(np.maximum.reduceat(np.einsum("ij,ij->i", apart, apart), first))
+    wide -= np.repeat(axis, counts, axis=1)
+    chord = np.sqrt(np.maximum.reduceat((wide**2).sum(axis=0), first))
     angle = 2 * np.arcsin(np.minimum(chord / 2, 1)) + _TINY
-    return axis, np.where(whole, np.minimum(angle, np.pi), np.pi)
+    return np.ascontiguousarray(axis.T), np.where(whole, np.minimum(angle, np.pi), np.pi)
 
 
 def merge_cones(axis: F8, angle: F8, parent: NDArray[np.integer]) -> tuple[F8, F8]:

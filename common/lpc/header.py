@@ -7,79 +7,31 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import struct
 import zlib
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .attributes import MAX_ATTRIBUTES, MAX_NAME, Attribute, Schema
+from .attributes import MAX_ATTRIBUTES, Attribute, Schema
+from .constants import Constant
 from .errors import Corrupt, FormatError, NotAModel, Truncated, UnsupportedVersion
+from .header_checks import check_attributes, check_counts, check_geometry
 from .page import PAGE_HEADER, RECORD, SMALLEST_CLOUD
-from .payload import MAX_SAMPLES
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from numpy.typing import NDArray
 
 MAGIC = b"\x89LPC\r\n\x1a\n"
 MAJOR, MINOR = 1, 0
 HEADER_PROBE = 65536  # bytes of the first read: header, first page and first clouds
 MAX_TEXT = 49_152  # leaves a quarter of the probe to the first page and clouds
-MAX_NODES = 2**31 - 1  # numbers of nodes are int32 in memory
-MAX_COUNT = 2**53  # counts beyond it are no longer exact in the JSON of other languages
-MAX_LEVELS = 256
 
 _FIXED = struct.Struct("<8sHHIII")
 _Bytes = bytes  # the field `bytes` of Header hides the builtin inside the class
-
-
-@dataclass(frozen=True, slots=True)
-class Constant:
-    """The one value that an attribute has everywhere; it costs nothing per sample.
-
-    Parameters
-    ----------
-    dtype : str
-        numpy dtype of a component, little-endian.
-    value : int, float or tuple of them
-        A tuple for attributes of several components (``normal``, ``color``). Floats are finite.
-    """
-
-    dtype: str
-    value: int | float | tuple[int | float, ...]
-
-    def __post_init__(self) -> None:
-        parts = self.value if isinstance(self.value, tuple) else (self.value,)
-        if not 1 <= len(parts) <= 4 or not all(_is_number(part) for part in parts):
-            raise Corrupt(f"header: constant value {str(self.value)[:40]} is not a number or a few of them")
-        try:
-            item = np.dtype(self.dtype)
-            if item.kind not in "iuf" or item.itemsize > 8:
-                raise Corrupt(f"header: constant of dtype {self.dtype!r} is not a plain number")
-            with np.errstate(over="raise"):
-                np.array(self.value, dtype=item)
-        except (TypeError, ValueError, OverflowError, FloatingPointError) as error:
-            if isinstance(error, Corrupt):
-                raise
-            raise Corrupt(f"header: constant {self.value} does not fit dtype {self.dtype!r}") from error
-
-    def fill(self, samples: int) -> NDArray[Any]:
-        """Values of `samples` samples: (samples,) or (samples, components), read-only and without memory of its own."""
-        value = np.array(self.value, dtype=self.dtype)
-        return np.broadcast_to(value, (samples, *value.shape))
-
-    def to_json(self) -> dict[str, object]:
-        """As it stands in the header."""
-        return {"dtype": self.dtype, "value": list(self.value) if isinstance(self.value, tuple) else self.value}
-
-    @classmethod
-    def from_json(cls, entry: object) -> Constant:
-        """Inverse of `to_json`; raises Corrupt."""
-        if not isinstance(entry, dict) or not isinstance(entry.get("dtype"), str) or "value" not in entry:
-            raise Corrupt(f"header: constant {str(entry)[:80]} has no dtype and value")
-        value = entry["value"]
-        return cls(entry["dtype"], tuple(value) if isinstance(value, list) else value)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,9 +79,9 @@ class Header:
     digest_text: _Bytes = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        _check_counts(self)
-        _check_geometry(self)
-        _check_attributes(self)
+        check_counts(self)
+        check_geometry(self)
+        check_attributes(self)
         text = _dump(self.to_json())
         object.__setattr__(self, "digest_text", _without_digest(text, self.digest))
         _place_page0(self, len(text))
@@ -300,69 +252,3 @@ def _from_json(entry: dict[str, Any]) -> Header:
     values["attributes"] = tuple(Attribute.from_json(item) for item in listed[: MAX_ATTRIBUTES + 1])
     values["constants"] = {name: Constant.from_json(item) for name, item in values["constants"].items()}
     return Header(**values, extra={name: value for name, value in entry.items() if name not in known})
-
-
-def _is_number(value: object) -> bool:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return isinstance(value, int) or math.isfinite(value)
-
-
-def _check_counts(header: Header) -> None:
-    for name, low, high in (
-        ("bytes", 1, MAX_COUNT),
-        ("samples", 1, MAX_COUNT),
-        ("nodes", 1, MAX_NODES),
-        ("levels", 1, MAX_LEVELS),
-        ("cloud_size", 1, MAX_SAMPLES),
-        ("page_nodes", 1, 4096),
-        ("seed", -(2**63), 2**64 - 1),
-    ):
-        value = getattr(header, name)
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise Corrupt(f"header: {name} is {str(value)[:40]} (a whole number from {low} to {high} is expected)")
-    if header.samples < header.nodes:
-        raise Corrupt(f"header: {header.samples} samples are too few for {header.nodes} nodes")
-    if header.levels > header.nodes:
-        raise Corrupt(f"header: {header.levels} levels are too many for {header.nodes} nodes")
-    digest = header.digest
-    if not isinstance(digest, str) or len(digest) != 32 or digest.strip("0123456789abcdef"):
-        raise Corrupt("header: digest is not 32 hexadecimal digits")
-
-
-def _check_geometry(header: Header) -> None:
-    for name, length in (("origin", 3), ("bounds", 6), ("spacing_ratio", 3)):
-        values = getattr(header, name)
-        if not isinstance(values, tuple) or len(values) != length or not all(_is_number(value) for value in values):
-            raise Corrupt(f"header: {name} is not {length} finite numbers")
-    for name in ("step", "side", "spacing", "position_error"):
-        value = getattr(header, name)
-        if not _is_number(value) or value < 0:
-            raise Corrupt(f"header: {name} is {str(value)[:40]} (a finite length is expected)")
-    if not (header.step > 0 and header.side > 0):
-        raise Corrupt("header: step and side must be above 0")
-    slack = header.position_error + header.side * 2.0**-31 + 1e-9 * max(map(abs, header.bounds))
-    for axis in range(3):
-        low, high = header.bounds[axis], header.bounds[axis + 3]
-        if not low <= high:
-            raise Corrupt(f"header: bounds {low} to {high} are empty")
-        if low < header.origin[axis] - slack or high > header.origin[axis] + header.side + slack:
-            raise Corrupt("header: bounds reach out of the box of origin and side")
-
-
-def _check_attributes(header: Header) -> None:
-    names = [attribute.name for attribute in header.attributes] + list(header.constants)
-    if len(names) > MAX_ATTRIBUTES:
-        raise Corrupt(f"header: more than {MAX_ATTRIBUTES} attributes")
-    if len(set(names)) != len(names):
-        raise Corrupt("header: an attribute is named twice")
-    if not all(0 < len(name) <= MAX_NAME for name in names):
-        raise Corrupt(f"header: names of attributes have 1 to {MAX_NAME} characters")
-    if not (header.crs is None or isinstance(header.crs, str)) or not isinstance(header.generator, str):
-        raise Corrupt("header: crs and generator must be text")
-    for name, kind in (("left_out", str), ("rejected", int)):
-        for key, value in getattr(header, name).items():
-            if not isinstance(value, kind) or isinstance(value, bool):
-                raise Corrupt(f"header: {name} of {key[:40]} is not a {'text' if kind is str else 'count'}")
-    if not all(_is_number(value) for value in header.bits_per_sample.values()):
-        raise Corrupt("header: bits_per_sample are not numbers")

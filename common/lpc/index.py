@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from .bounds import decode_centers, decode_cones
 from .errors import Corrupt, FormatError
-from .header import Header
 from .page import PAGE_HEADER, RECORD, SMALLEST_CLOUD, Page, child_counts, child_page_numbers, page_bytes, parse_page
 from .ranges import ByteRange
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from .header import Header
 
 
 class IndexTree:

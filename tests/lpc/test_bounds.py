@@ -1,12 +1,12 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from strategies import random_records
 
 from lpc.bounds import (
@@ -25,6 +25,9 @@ from lpc.bounds import (
     segment_radii,
 )
 from lpc.page import child_counts
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 seeds = st.integers(0, 2**32 - 1)
 shapes = st.lists(st.sampled_from([0, 1, 2, 3, 3]), max_size=12)

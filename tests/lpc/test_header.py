@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from strategies import fake_models, headers
 
 from lpc.attributes import Attribute
+from lpc.constants import Constant
 from lpc.errors import Corrupt, FormatError, NotAModel, Truncated, UnsupportedVersion
-from lpc.header import MAX_TEXT, Constant, Header, compute_digest, parse_header
+from lpc.header import MAX_TEXT, Header, compute_digest, parse_header
 
 PLAIN = Header(
     bytes=10_000, samples=3000, nodes=3, levels=2, cloud_size=1000, page_nodes=2, origin=(0.0, 0.0, 0.0), step=0.5,

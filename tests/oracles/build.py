@@ -10,10 +10,9 @@ import math
 import zlib
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lpc.attributes import Attribute, Schema
 from lpc.codec import encode_cloud
@@ -21,7 +20,11 @@ from lpc.header import Header, seal
 from lpc.lattice import position_error_bound, position_step, quantise
 from lpc.octahedral import decode_normals, encode_normals
 from lpc.page import NO_CONE, RECORD, pack_pages
-from lpc.points import PointBatch
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from lpc.points import PointBatch
 
 
 @dataclass(slots=True)

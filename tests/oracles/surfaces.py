@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lpc.points import PointBatch
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 
 def sphere(n: int, *, seed: int = 0, radius: float = 1.0, color: bool = False, normals: bool = True) -> PointBatch:
