@@ -2,7 +2,7 @@
 
 ::
 
-    client ◀──socket──▶ _End ◀── Line (one Link a direction, shared by all connections) ──▶ _End ◀──socket──▶ upstream
+    client ◀─socket─▶ RelayEnd ◀── Line: one Link a direction for all connections ──▶ RelayEnd ◀─socket─▶ upstream
 
 The front relays bytes. For http: and https: upstreams it also replaces the Host header of each request, so that
 ``pointstream link https://models.example.org`` works with the paths of that server; redirects to absolute addresses
@@ -20,17 +20,19 @@ link has carried.
 from __future__ import annotations
 
 import asyncio
+import errno
+import os
 import selectors
 import socket
 import ssl
-import struct
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
 from urllib.parse import urlsplit
 
 from lpc.errors import Unavailable
 from pointlink.hosts import HostRewriter
-from pointlink.wire import End, Flow, Line
+from pointlink.relay import RelayEnd
+from pointlink.wire import Flow, Line
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -101,7 +103,7 @@ class Front:
         self._listener = listener
         self._profile = profile
         self._server: asyncio.Server | None = None
-        self._ends: set[_End] = set()
+        self._ends: set[RelayEnd] = set()
         self._connecting: set[asyncio.Task[None]] = set()
 
     @property
@@ -138,7 +140,7 @@ class Front:
     def _accept(self) -> asyncio.Protocol:
         buffer = _bytes_in(LOOKAHEAD, self._profile)
         rewriter = None if self.upstream.scheme == "tcp" else HostRewriter(self.upstream.authority)
-        near, far = _End(self._ends, buffer, rewriter), _End(self._ends, buffer)
+        near, far = RelayEnd(self._ends, buffer, rewriter), RelayEnd(self._ends, buffer)
         up = Flow(self.line.up, on_data=far.data_arrived, on_end=far.end_arrived, on_room=near.room_made)
         down = Flow(self.line.down, on_data=near.data_arrived, on_end=near.end_arrived, on_room=far.room_made)
         near.attach(out=up, source=down)
@@ -153,7 +155,7 @@ class Front:
         self.line.handshake(reach, near.open_gate)
         return near
 
-    async def _reach(self, far: _End) -> None:
+    async def _reach(self, far: RelayEnd) -> None:
         upstream = self.upstream
         secure = ssl.create_default_context() if upstream.scheme == "https" else None
         try:
@@ -176,8 +178,9 @@ async def check_upstream(upstream: Upstream) -> None:
     try:
         (await _connect(upstream, SMALLEST_BUFFER)).close()
     except OSError as error:
-        reason = error.strerror or str(error) or f"nothing within {CONNECT_SECONDS:g} s"
-        raise Unavailable(f"cannot connect to {upstream.authority} ({reason}); start that server first") from error
+        raise Unavailable(
+            f"cannot connect to {upstream.authority} ({_reason(error)}); start that server first"
+        ) from error
 
 
 async def serve_front(upstream: Upstream, profile: Profile, *, host: str = "127.0.0.1", port: int = 0) -> Front:
@@ -196,7 +199,7 @@ async def serve_front(upstream: Upstream, profile: Profile, *, host: str = "127.
         listener.bind((host, port))
     except OSError as error:
         listener.close()
-        raise Unavailable(f"cannot listen on {host}:{port} ({error.strerror}); give another --port") from error
+        raise Unavailable(f"cannot listen on {host}:{port} ({_reason(error)}); give another --port") from error
     front = Front(upstream, profile, listener)
     await front.start()
     return front
@@ -211,145 +214,18 @@ def precise_loop() -> asyncio.SelectorEventLoop:
     return asyncio.SelectorEventLoop(selectors.SelectSelector())
 
 
-class _End(asyncio.Protocol):
-    """One real socket of a connection: what it reads goes into one flow, what the other flow brings is written.
-
-    The socket comes later than the object and may go earlier; what the line brings before is kept, after is thrown
-    away.
-    """
-
-    def __init__(self, ends: set[_End], buffer: int, rewriter: HostRewriter | None = None) -> None:
-        self._ends = ends
-        self._buffer = buffer
-        self._rewriter = rewriter
-        self._out: Flow
-        self._source: Flow
-        self._transport: asyncio.Transport | None = None
-        self._early = bytearray()
-        self._gate_open = False
-        self._gone = False
-        self._heard_all = False
-        self._told_all = False
-        self._writing_paused = False
-        self._unwritten = 0
-
-    def attach(self, *, out: Flow, source: Flow) -> None:
-        """Join this end to its two flows."""
-        self._out, self._source = out, source
-
-    def open_gate(self) -> None:
-        """Begin to read: the handshake is over."""
-        self._gate_open = True
-        self.room_made()
-
-    def fail(self) -> None:
-        """Say to the other end that there is nobody here."""
-        self._gone = True
-        self._out.end(End.RESET)
-
-    def abort(self) -> None:
-        """Reset the socket."""
-        self._gone = True
-        if self._transport is not None:
-            _reset(self._transport)
-
-    # The line's side.
-
-    def data_arrived(self, data: bytes) -> None:
-        """Write what the line brings."""
-        if self._gone:
-            self._source.consumed(len(data))
-        elif self._transport is None:
-            self._early += data
-        else:
-            self._transport.write(data)
-            self._unwritten += len(data)
-            if not self._writing_paused:
-                self.resume_writing()
-
-    def end_arrived(self, how: End) -> None:
-        """Learn from the line that the other end has stopped."""
-        self._told_all = True
-        if how is End.RESET:
-            self._out.drop()
-            self.abort()
-        elif self._transport is not None:
-            self._pass_end(self._transport)
-
-    def room_made(self) -> None:
-        """Read on when enough has left for the line."""
-        if self._transport is not None and self._gate_open and self._out.buffered <= self._buffer:
-            self._transport.resume_reading()
-
-    # The socket's side.
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Take the socket."""
-        assert isinstance(transport, asyncio.Transport)
-        self._transport = transport
-        self._ends.add(self)
-        if self._gone:
-            _reset(transport)
-            return
-        transport.set_write_buffer_limits(high=SMALLEST_BUFFER)
-        if not self._gate_open:
-            transport.pause_reading()
-        if self._early:
-            early, self._early = bytes(self._early), bytearray()
-            self.data_arrived(early)
-        if self._told_all:
-            self._pass_end(transport)
-
-    def data_received(self, data: bytes) -> None:
-        """Send what was read over the line."""
-        self._out.send(self._rewriter.feed(data) if self._rewriter else data)
-        if self._out.buffered > self._buffer and self._transport is not None:
-            self._transport.pause_reading()
-
-    def eof_received(self) -> bool:
-        """Pass on that nothing more will be read; keep writing while the line brings something."""
-        self._heard_all = True
-        if self._rewriter:
-            self._out.send(self._rewriter.finish())
-        self._out.end(End.HALF)
-        return not self._told_all and self._transport is not None and self._transport.can_write_eof()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Tell the other end, unless both had ended in order."""
-        self._transport = None
-        self._gone = True
-        self._ends.discard(self)
-        if exc is not None or not (self._heard_all and self._told_all):
-            self._out.end(End.RESET)
-
-    def pause_writing(self) -> None:
-        """Hold the line back: the socket takes no more."""
-        self._writing_paused = True
-
-    def resume_writing(self) -> None:
-        """Let the line bring more."""
-        self._writing_paused = False
-        size, self._unwritten = self._unwritten, 0
-        self._source.consumed(size)
-
-    def _pass_end(self, transport: asyncio.Transport) -> None:
-        if self._heard_all:
-            transport.close()
-        elif transport.can_write_eof():
-            transport.write_eof()
-
-
-def _reset(transport: asyncio.Transport) -> None:
-    sock = transport.get_extra_info("socket")
-    if sock is not None:
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-    transport.abort()
-
-
 def _bytes_in(seconds: float, profile: Profile) -> int:
     """Return what the link carries in so many seconds, within what sockets are asked to hold."""
     rate = profile.down_rate
     return LARGEST_BUFFER if rate is None else min(LARGEST_BUFFER, max(SMALLEST_BUFFER, int(rate / 8.0 * seconds)))
+
+
+def _reason(error: OSError) -> str:
+    if isinstance(error, TimeoutError):
+        return f"nothing within {CONNECT_SECONDS:g} s"
+    if error.errno is not None and error.errno in errno.errorcode and not isinstance(error, socket.gaierror):
+        return os.strerror(error.errno)
+    return error.strerror or str(error)
 
 
 async def _connect(upstream: Upstream, buffer: int) -> socket.socket:

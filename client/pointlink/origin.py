@@ -12,27 +12,22 @@ ones (:func:`serve_origin`). It is no server for the world: see ``pointserve`` f
 from __future__ import annotations
 
 import asyncio
-import hashlib
-import inspect
-import re
 import socket
 import struct
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 from urllib.parse import unquote
 
 import h11
 
-from lpc.errors import NotFound
-from pointlink.faults import Fault, IgnoreRange, OtherEtag, ResetNow, Shift, Status, before_head, spoil
+from pointlink.faults import Fault, ResetNow, before_head, spoil
+from pointlink.resources import CHUNK, body_of, decide
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
-    from pathlib import Path
+    from collections.abc import Callable, Mapping
 
-CHUNK = 64 * 1024
-_RANGE = re.compile(r"bytes\s*=\s*(?:(\d+)-(\d*)|-(\d+))\s*", re.IGNORECASE)
+    from pointlink.resources import Resource
 
 
 class Reader(Protocol):
@@ -73,55 +68,6 @@ class Writer(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Resource:
-    """Something to serve.
-
-    Parameters
-    ----------
-    length
-        Bytes.
-    etag
-        Strong entity tag with its quotes.
-    read
-        ``read(start, stop)`` returns those bytes or an awaitable of them; fewer make the origin cut the reply.
-    content_type
-        Media type.
-    """
-
-    length: int
-    etag: str
-    read: Callable[[int, int], bytes | Awaitable[bytes]]
-    content_type: str = "application/octet-stream"
-
-    @classmethod
-    def from_bytes(cls, data: bytes) -> Resource:
-        """Serve these bytes under a tag of their content."""
-        return cls(length=len(data), etag=f'"{hashlib.sha256(data).hexdigest()[:16]}"', read=lambda a, b: data[a:b])
-
-    @classmethod
-    def from_path(cls, path: Path) -> Resource:
-        """Serve a file as long as it is now; it is read anew for each range.
-
-        Raises
-        ------
-        NotFound
-            There is no such readable file.
-        """
-
-        def read(start: int, stop: int) -> bytes:
-            with path.open("rb") as file:
-                file.seek(start)
-                return file.read(stop - start)
-
-        try:
-            read(0, 1)
-            stat = path.stat()
-        except OSError as error:
-            raise NotFound(f"{path}: cannot be read ({error.strerror}); give the path of a file") from error
-        return cls(length=stat.st_size, etag=f'"{stat.st_size:x}-{stat.st_mtime_ns:x}"', read=read)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class Exchange:
     """One request that was answered: what was asked and what went out.
 
@@ -143,15 +89,6 @@ class Exchange:
     start: int
     stop: int
     status: int
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class _Reply:
-    status: int
-    headers: tuple[tuple[str, str], ...] = ()
-    resource: Resource | None = None
-    start: int = 0
-    stop: int = 0
 
 
 def _no_fault(number: int) -> Fault | None:  # noqa: ARG001
@@ -226,7 +163,7 @@ class Origin:
         fault = self.fault(number)
         headers = {name.decode("ascii"): value.decode("latin-1") for name, value in request.headers}
         method, path = request.method.decode("ascii"), unquote(request.target.decode("ascii").partition("?")[0])
-        reply = _reply(method, self.resources.get(path), headers, fault)
+        reply = decide(method, self.resources.get(path), headers, fault)
         self.log.append(
             Exchange(number=number, method=method, path=path, start=reply.start, stop=reply.stop, status=reply.status)
         )
@@ -235,7 +172,7 @@ class Origin:
         writer.write(connection.send(head) or b"")
         missing = reply.stop - reply.start
         if method != "HEAD":
-            async for data in spoil(fault, missing, _body(reply)):
+            async for data in spoil(fault, missing, body_of(reply)):
                 writer.write(connection.send(h11.Data(data=data)) or b"")
                 missing -= len(data)
                 await writer.drain()
@@ -256,81 +193,6 @@ async def serve_origin(origin: Origin, *, host: str = "127.0.0.1", port: int = 0
         task.add_done_callback(serving.discard)
 
     return await asyncio.start_server(connected, host, port)
-
-
-def select_range(text: str | None, length: int) -> tuple[int, int] | None:
-    """Return the one range ``[start, stop)`` that a Range header asks of ``length`` bytes; None: send everything.
-
-    Raises
-    ------
-    IndexError
-        The range is well formed and lies outside (416).
-    """
-    match = _RANGE.fullmatch(text.strip()) if text else None
-    if match is None:
-        return None
-    first, last, suffix = match.groups()
-    if suffix is not None:
-        start, stop = max(0, length - int(suffix)), length
-    else:
-        start, stop = int(first), min(length, int(last) + 1) if last else length
-        if last and int(last) < start:
-            return None
-    if start >= stop:
-        raise IndexError(text)
-    return start, stop
-
-
-def _reply(method: str, resource: Resource | None, asked: dict[str, str], fault: Fault | None) -> _Reply:
-    empty = ("content-length", "0")
-    if isinstance(fault, Status):
-        retry = (("retry-after", fault.retry_after),) if fault.retry_after is not None else ()
-        return _Reply(status=fault.code, headers=(empty, *retry))
-    if resource is None:
-        return _Reply(status=404, headers=(empty,))
-    if method not in ("GET", "HEAD"):
-        return _Reply(status=405, headers=(empty, ("allow", "GET, HEAD")))
-    if isinstance(fault, OtherEtag):
-        resource = replace(resource, etag=fault.etag)
-    tag = ("etag", resource.etag)
-    if "if-match" in asked and not _lists(asked["if-match"], resource.etag):
-        return _Reply(status=412, headers=(empty, tag))
-    if "if-none-match" in asked and _lists(asked["if-none-match"], resource.etag):
-        return _Reply(status=304, headers=(tag,))
-    common = (tag, ("accept-ranges", "bytes"), ("content-type", resource.content_type))
-    wanted = None
-    if method == "GET" and asked.get("if-range", resource.etag) == resource.etag and not isinstance(fault, IgnoreRange):
-        try:
-            wanted = select_range(asked.get("range"), resource.length)
-        except IndexError:
-            return _Reply(status=416, headers=(empty, tag, ("content-range", f"bytes */{resource.length}")))
-    if wanted is None:
-        size = ("content-length", str(resource.length))
-        return _Reply(status=200, headers=(size, *common), resource=resource, stop=resource.length)
-    start, stop = wanted
-    if isinstance(fault, Shift):
-        start, stop = min(start + fault.by, resource.length - 1), min(stop + fault.by, resource.length)
-    place = ("content-range", f"bytes {start}-{stop - 1}/{resource.length}")
-    size = ("content-length", str(stop - start))
-    return _Reply(status=206, headers=(size, place, *common), resource=resource, start=start, stop=stop)
-
-
-def _lists(header: str, etag: str) -> bool:
-    return header.strip() == "*" or etag in [item.strip() for item in header.split(",")]
-
-
-async def _body(reply: _Reply) -> AsyncIterator[bytes]:
-    if reply.resource is None:
-        return
-    at = reply.start
-    while at < reply.stop:
-        data = reply.resource.read(at, min(at + CHUNK, reply.stop))
-        if inspect.isawaitable(data):
-            data = await data
-        if not data:
-            return
-        yield data
-        at += len(data)
 
 
 def _reset(writer: Writer) -> None:

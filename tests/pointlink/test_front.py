@@ -13,8 +13,9 @@ import pytest
 
 from lpc.errors import Unavailable
 from pointlink.front import Front, Upstream, check_upstream, parse_upstream, serve_front
-from pointlink.origin import Origin, Resource, serve_origin
+from pointlink.origin import Origin, serve_origin
 from pointlink.profiles import Profile
+from pointlink.resources import Resource
 
 QUICK = Profile(down_rate=400e6, up_rate=400e6, rtt=0.002, queue=32 * 1024)
 Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]

@@ -8,8 +8,10 @@ import httpx
 import pytest
 
 from pointlink.memory import Network, transport
-from pointlink.origin import Origin, Resource
+from pointlink.origin import Origin
 from pointlink.profiles import ADSL, NONE, Profile
+from pointlink.resources import Resource
+from pointlink.stream import MemoryStream
 from pointlink.virtual import run
 
 BODY = bytes(range(251)) * 5000
@@ -83,3 +85,135 @@ def test_without_a_limit_nothing_takes_time() -> None:
         return asyncio.get_running_loop().time()
 
     assert run(main()) == 0.0
+
+
+def test_connections_share_the_one_link() -> None:
+    async def main() -> tuple[float, float]:
+        loop = asyncio.get_running_loop()
+        network = Network(origin(), ADSL)
+        clients = [httpx.AsyncClient(transport=network.transport(), timeout=None) for _ in range(3)]
+        await asyncio.gather(*(client.get("http://o/model.lpc", headers=asked(0, 200_000)) for client in clients))
+        for client in clients:
+            await client.aclose()
+        return loop.time(), network.line.down.link.carried * 8 / 1.25e6
+
+    seconds, in_theory = run(main())
+    assert in_theory + 0.1 < seconds < in_theory + 0.15
+
+
+@pytest.mark.parametrize("queue", [8 * 1024, 128 * 1024])
+def test_an_urgent_request_waits_for_the_queue_before_it(queue: int) -> None:
+    async def main() -> float:
+        loop = asyncio.get_running_loop()
+        network = Network(origin(), Profile(down_rate=1.25e6, up_rate=1.25e6, rtt=0.05, queue=queue))
+        async with httpx.AsyncClient(transport=network.transport(), timeout=None) as client:
+            await asyncio.gather(*(client.get("http://o/model.lpc", headers=asked(0, 1)) for _ in range(2)))
+            bulk = asyncio.create_task(client.get("http://o/model.lpc"))
+            await asyncio.sleep(3)
+            began = loop.time()
+            await client.get("http://o/model.lpc", headers=asked(0, 4096))
+            took = loop.time() - began
+            assert not bulk.done()
+            await bulk
+        return took
+
+    # A round trip on an open connection, the queue, and 4 KB of which every second piece is the bulk's.
+    expected = 0.05 + (queue + 2 * 4096) * 8 / 1.25e6
+    assert run(main()) == pytest.approx(expected, rel=0.15)
+
+
+def test_a_client_that_leaves_stops_the_server_but_not_what_is_queued() -> None:
+    async def main() -> tuple[int, float]:
+        loop = asyncio.get_running_loop()
+        network = Network(origin(), ADSL)
+        async with httpx.AsyncClient(transport=network.transport(), timeout=None) as client:
+            async with client.stream("GET", "http://o/model.lpc") as reply:
+                async for _ in reply.aiter_raw():
+                    if loop.time() > 1.0:
+                        break
+            await asyncio.sleep(10)
+        return network.line.down.link.carried, network.line.down.link.windows[-1][1]
+
+    carried, busy_until = run(main())
+    # What was read in a second, the queue behind it, and what the server could still push in half a round trip.
+    assert carried * 8 / 1.25e6 < 1.0 + (ADSL.queue + 16 * 1024) * 8 / 1.25e6
+    assert 1.0 < busy_until < 1.35
+
+
+def test_a_reader_that_rests_holds_the_sender_back() -> None:
+    async def main() -> tuple[int, bytes]:
+        network = Network(origin(), Profile(down_rate=100e6, up_rate=100e6, rtt=0.001, queue=64 * 1024))
+        stream = await network.open_connection()
+        stream.write(b"GET /model.lpc HTTP/1.1\r\nHost: o\r\nConnection: close\r\n\r\n")
+        await asyncio.sleep(60)
+        held = network.line.down.link.carried
+        data = b""
+        while part := await stream.read(1000):
+            data += part
+        return held, data
+
+    held, data = run(main())
+    assert 0 < held <= 256 * 1024
+    assert data.endswith(BODY)
+
+
+def test_half_a_connection_may_end_before_the_other() -> None:
+    class Reverse(Origin):
+        async def handle(self, reader: object, writer: object) -> None:
+            assert isinstance(reader, MemoryStream)
+            asked = b""
+            while data := await reader.read():
+                asked += data
+            reader.write(asked[::-1])
+            reader.close()
+
+    async def main() -> bytes:
+        stream = await Network(Reverse(resources={}), ADSL).open_connection()
+        stream.write(b"abc" * 5000)
+        stream.write_eof()
+        answer = b""
+        while data := await stream.read(777):
+            answer += data
+        return answer
+
+    assert run(main()) == b"cba" * 5000
+
+
+def test_patience_is_virtual_too() -> None:
+    async def main() -> float:
+        slow = Profile(down_rate=8e3, up_rate=8e6, rtt=1.0, queue=32 * 1024)
+        async with httpx.AsyncClient(transport=transport(origin(), slow), timeout=httpx.Timeout(0.5)) as client:
+            with pytest.raises(httpx.ConnectTimeout):
+                await client.get("http://o/model.lpc")
+            client.timeout = httpx.Timeout(1.25, read=1.1)
+            with pytest.raises(httpx.ReadTimeout):
+                await client.get("http://o/model.lpc", headers=asked(0, 100_000))
+        return asyncio.get_running_loop().time()
+
+    # Half a second; one to connect; the first piece would come after one and 1448 ms.
+    assert run(main()) == pytest.approx(0.5 + 1.0 + 1.1, abs=0.01)
+
+
+def test_there_is_no_tls_and_it_says_so() -> None:
+    async def main() -> None:
+        async with httpx.AsyncClient(transport=transport(origin(), NONE)) as client:
+            with pytest.raises(httpx.ConnectError, match="no TLS"):
+                await client.get("https://o/model.lpc")
+
+    run(main())
+
+
+def test_a_hundred_cancelled_requests_leave_the_link_and_the_server_usable() -> None:
+    async def main() -> bytes:
+        network = Network(origin(), ADSL)
+        for number in range(100):
+            client = httpx.AsyncClient(transport=network.transport(), timeout=None)
+            task = asyncio.create_task(client.get("http://o/model.lpc", headers=asked(0, 50_000)))
+            await asyncio.sleep(0.013 * (number % 20))
+            task.cancel()
+            await asyncio.wait([task])
+            await client.aclose()
+        async with httpx.AsyncClient(transport=network.transport(), timeout=None) as client:
+            return (await client.get("http://o/model.lpc", headers=asked(7, 77))).content
+
+    assert run(main()) == BODY[7:77]
