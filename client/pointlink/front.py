@@ -35,6 +35,7 @@ from pointlink.relay import RelayEnd
 from pointlink.wire import Flow, Line
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from types import TracebackType
 
     from pointlink.profiles import Profile
@@ -156,13 +157,8 @@ class Front:
         return near
 
     async def _reach(self, far: RelayEnd) -> None:
-        upstream = self.upstream
-        secure = ssl.create_default_context() if upstream.scheme == "https" else None
         try:
-            sock = await _connect(upstream, _bytes_in(LOOKAHEAD, self._profile))
-            await asyncio.get_running_loop().create_connection(
-                lambda: far, sock=sock, ssl=secure, server_hostname=upstream.host if secure else None
-            )
+            await _connect(self.upstream, lambda: far, _bytes_in(LOOKAHEAD, self._profile))
         except OSError:
             far.fail()
 
@@ -173,13 +169,13 @@ async def check_upstream(upstream: Upstream) -> None:
     Raises
     ------
     Unavailable
-        Nobody listens there.
+        Nobody listens there, or somebody without a valid certificate.
     """
     try:
-        (await _connect(upstream, SMALLEST_BUFFER)).close()
+        (await _connect(upstream, asyncio.Protocol, SMALLEST_BUFFER)).close()
     except OSError as error:
         raise Unavailable(
-            f"cannot connect to {upstream.authority} ({_reason(error)}); start that server first"
+            f"cannot connect to {upstream.authority} ({_reason(error)}); check the address and that this server runs"
         ) from error
 
 
@@ -223,30 +219,41 @@ def _bytes_in(seconds: float, profile: Profile) -> int:
 def _reason(error: OSError) -> str:
     if isinstance(error, TimeoutError):
         return f"nothing within {CONNECT_SECONDS:g} s"
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return error.verify_message
     if error.errno is not None and error.errno in errno.errorcode and not isinstance(error, socket.gaierror):
         return os.strerror(error.errno)
     return error.strerror or str(error)
 
 
-async def _connect(upstream: Upstream, buffer: int) -> socket.socket:
+async def _connect(upstream: Upstream, protocol: Callable[[], asyncio.Protocol], buffer: int) -> asyncio.BaseTransport:
+    secure = ssl.create_default_context() if upstream.scheme == "https" else None
+    async with asyncio.timeout(CONNECT_SECONDS):
+        sock = await _open_socket(upstream, buffer)
+        transport, _ = await asyncio.get_running_loop().create_connection(
+            protocol, sock=sock, ssl=secure, server_hostname=upstream.host if secure else None
+        )
+    return transport
+
+
+async def _open_socket(upstream: Upstream, buffer: int) -> socket.socket:
     """Connect with a small receive buffer, which must be set before."""
     loop = asyncio.get_running_loop()
     last: OSError = OSError(f"{upstream.host} has no address")
-    async with asyncio.timeout(CONNECT_SECONDS):
-        for family, kind, protocol, _, address in await loop.getaddrinfo(
-            upstream.host, upstream.port, type=socket.SOCK_STREAM
-        ):
-            sock = socket.socket(family, kind, protocol)
-            try:
-                sock.setblocking(False)
-                sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer)
-                await loop.sock_connect(sock, address)
-            except OSError as error:
-                sock.close()
-                last = error
-            except BaseException:
-                sock.close()
-                raise
-            else:
-                return sock
+    for family, kind, protocol, _, address in await loop.getaddrinfo(
+        upstream.host, upstream.port, type=socket.SOCK_STREAM
+    ):
+        sock = socket.socket(family, kind, protocol)
+        try:
+            sock.setblocking(False)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer)
+            await loop.sock_connect(sock, address)
+        except OSError as error:
+            sock.close()
+            last = error
+        except BaseException:
+            sock.close()
+            raise
+        else:
+            return sock
     raise last

@@ -29,6 +29,9 @@ SEGMENT = 1448
 SHORTEST_PIECE = 1e-4
 """Seconds. Above 116 Mbit/s a piece is this much of the link, as network cards offload segments in batches."""
 
+UNLIMITED_PIECE = 64 * 1024
+"""Bytes of a piece where there is no rate."""
+
 
 class Piece(NamedTuple, Generic[F]):
     """Bytes of one flow that have entered the queue.
@@ -75,7 +78,7 @@ class Link(Generic[F]):
         self.rate = rate
         self.delay = delay
         self.queue = queue
-        self.piece = SEGMENT if rate is None else max(SEGMENT, round(rate / 8.0 * SHORTEST_PIECE))
+        self.piece = UNLIMITED_PIECE if rate is None else max(SEGMENT, round(rate / 8.0 * SHORTEST_PIECE))
         self.carried = 0
         self.windows: list[tuple[float, float]] = []
         self._seconds_per_byte = 0.0 if rate is None else 8.0 / rate

@@ -120,11 +120,11 @@ class RelayEnd(asyncio.Protocol):
         return not self._told_all and self._transport is not None and self._transport.can_write_eof()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Tell the other end, unless both had ended in order."""
+        """Tell the other end, unless all that was to be read has been."""
         self._transport = None
         self._gone = True
         self._ends.discard(self)
-        if exc is not None or not (self._heard_all and self._told_all):
+        if exc is not None or not self._heard_all:
             self._out.end(End.RESET)
 
     def pause_writing(self) -> None:

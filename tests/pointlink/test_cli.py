@@ -90,5 +90,8 @@ def test_nobody_there_ends_with_1_and_one_line() -> None:
         port = closed.server_port
     result = CliRunner().invoke(link, [f"http://127.0.0.1:{port}", "--profile", "adsl"])
     assert result.exit_code == 1
-    assert result.stderr.strip() == f"cannot connect to 127.0.0.1:{port} (Connection refused); start that server first"
+    assert (
+        result.stderr.strip()
+        == f"cannot connect to 127.0.0.1:{port} (Connection refused); check the address and that this server runs"
+    )
     assert result.stdout == ""

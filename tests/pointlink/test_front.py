@@ -5,9 +5,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import random
+import shutil
 import socket
+import ssl
 import struct
+import subprocess
 from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -16,6 +20,9 @@ from pointlink.front import Front, Upstream, check_upstream, parse_upstream, ser
 from pointlink.origin import Origin, serve_origin
 from pointlink.profiles import Profile
 from pointlink.resources import Resource
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 QUICK = Profile(down_rate=400e6, up_rate=400e6, rtt=0.002, queue=32 * 1024)
 Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
@@ -151,6 +158,47 @@ async def test_ranges_of_a_real_origin_come_through() -> None:
             assert await reader.readexactly(stop - start) == body[start:stop]
         await hang_up(writer)
     assert front.line.down.link.carried > 264_000
+
+
+async def test_an_encrypted_upstream_is_spoken_to_in_its_own_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if shutil.which("openssl") is None:
+        pytest.skip("no openssl command to make a certificate with")
+    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
+    make = "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 2 -subj /CN=localhost"
+    names = ["-addext", "subjectAltName=DNS:localhost", "-keyout", key, "-out", certificate]
+    subprocess.run([*make.split(), *names], check=True, capture_output=True)  # noqa: ASYNC221
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, key)
+    body = random.Random(6).randbytes(150_000)
+    hosts: list[bytes] = []
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        hosts.append(await reader.readuntil(b"\r\n\r\n"))
+        writer.write(body)
+        await writer.drain()
+        await hang_up(writer)
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0, ssl=context)
+    port = server.sockets[0].getsockname()[1]
+    upstream = parse_upstream(f"https://localhost:{port}/")
+    async with server, await serve_front(upstream, QUICK) as front:
+        with pytest.raises(Unavailable, match="self-signed certificate"):
+            await check_upstream(upstream)
+        for trusted in (False, True):
+            if trusted:
+                monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+            reader, writer = await connect(front)
+            writer.write(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+            if trusted:
+                assert await reader.read() == body
+            else:
+                with pytest.raises(ConnectionResetError):
+                    await reader.read()
+            await hang_up(writer)
+    assert len(hosts) == 1
+    assert f"Host: localhost:{port}\r\n".encode() in hosts[0]
 
 
 async def test_nobody_upstream_is_said_at_once_and_resets_clients() -> None:
