@@ -29,16 +29,17 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from .attributes import Schema
+    from .header import Header
 
 Effort = Literal["default", "best", "fast"]
 Engine = Literal["auto", "numpy", "compiled"]
 
-WINDOW = 64
-"""Previous samples that predict an attribute: 16 cost 0.8 % more bytes and decode 1.7 times as fast."""
+WINDOWS: dict[Effort, int] = {"default": 64, "best": 64, "fast": 16}
+"""Previous samples that predict an attribute: with 16 a cloud takes 0.8 % more and decodes 1.7 times as fast."""
 
 ZSTD_MAGIC = bytes.fromhex("28b52ffd")
-MAX_FRAME_WINDOW = 1 << 30
-"""zstd's own window for payloads of the largest cloud with the widest schema stays below."""
+MAX_FRAME_WINDOW = 1 << 27
+"""What zstd itself takes as the most that a frame may ask of a reader."""
 
 
 class _Codec(Protocol):
@@ -76,7 +77,7 @@ class _Contexts(threading.local):
     """zstd contexts of one thread: costly to make and not safe to share."""
 
     def __init__(self) -> None:
-        self.decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_FRAME_WINDOW)
+        self.decompressor = zstandard.ZstdDecompressor()
         self.compressors: dict[Effort, zstandard.ZstdCompressor] = {}
 
     def compressor(self, effort: Effort) -> zstandard.ZstdCompressor:
@@ -92,9 +93,9 @@ def _parameters(effort: Effort) -> zstandard.ZstdCompressionParameters:
     """Return the encoder settings. Matches shorter than 7 bytes cost more than they save in streams of tokens."""
     if effort == "best":
         return zstandard.ZstdCompressionParameters.from_level(19, min_match=7, write_checksum=True)
-    strategy = {"default": zstandard.STRATEGY_LAZY2, "fast": zstandard.STRATEGY_LAZY}[effort]
+    # Faster strategies reuse another stream's Huffman codes in blocks below 1 KiB: 7 to 12 % more at M = 512.
     return zstandard.ZstdCompressionParameters.from_level(
-        6, min_match=7, strategy=strategy, search_log=2, write_checksum=True
+        6, min_match=7, strategy=zstandard.STRATEGY_LAZY, write_checksum=True
     )
 
 
@@ -117,7 +118,7 @@ def encode_cloud(
     schema : Schema
         The attributes that are written, in that order.
     effort : {"default", "best", "fast"}
-        What zstd spends. The payload is the same.
+        "fast" looks at fewer neighbours, for 0.8 % more bytes; "best" lets zstd search longer, for at most 0.3 % less.
 
     Returns
     -------
@@ -155,18 +156,19 @@ def encode_clouds(
         raise ValueError("lattice coordinates must stay below 2**52")
     rows = to_channels(codes, schema, len(lattice))
     encode = _codec(engine).encode
+    window = WINDOWS[effort]
     compressor = _contexts.compressor(effort)
     return [
-        _frame(encode(lattice, rows, begin, end, channels, WINDOW), channels, compressor)
+        _frame(encode(lattice, rows, begin, end, channels, window), window, channels, compressor)
         for begin, end in itertools.pairwise(edges)
     ]
 
 
-def _frame(packed: Packed, channels: Channels, compressor: zstandard.ZstdCompressor) -> bytes:
+def _frame(packed: Packed, window: int, channels: Channels, compressor: zstandard.ZstdCompressor) -> bytes:
     """Compress a payload with a block for each kind of number, so that each has Huffman codes of its own."""
     if packed.nbits > 16 or packed.shift > 32:
         raise ValueError(f"a cloud spans 2**{packed.nbits + packed.shift} steps, 2**48 are the most")
-    head = pack_header(packed, WINDOW) + packed.raw.tobytes()
+    head = pack_header(packed, window) + packed.raw.tobytes()
     stream = compressor.compressobj(size=len(head) + packed.tokens.size)
     out = [stream.compress(head)]
     for first, stop in ((-1, 0), *channels.groups):
@@ -227,14 +229,14 @@ def _payload(frame: bytes, limit: int) -> bytes:
         size = declared.content_size
         if size > limit:  # an unknown size is the largest number there is
             raise Corrupt(f"cloud: the frame declares {size} bytes, at most {limit} can be true")
-        if declared.dict_id or not declared.has_checksum:
-            raise Corrupt("cloud: the frame wants a dictionary or has no checksum")
+        if declared.dict_id or not declared.has_checksum or declared.window_size > MAX_FRAME_WINDOW:
+            raise Corrupt("cloud: the frame wants a dictionary or a huge window, or has no checksum")
         return _contexts.decompressor.decompress(frame, max_output_size=size, allow_extra_data=False)
     except zstandard.ZstdError as error:
         raise Corrupt(f"cloud: {error}") from error
 
 
-def cloud_to_points(cloud: Cloud, header: Any) -> PointBatch:
+def cloud_to_points(cloud: Cloud, header: Header) -> PointBatch:
     """Give the samples of a decoded cloud in model units.
 
     Parameters

@@ -204,9 +204,12 @@ def _nearest(xs: Any, ys: Any, zs: Any, i: int, window: int) -> Any:
 def _predecessors(xs: Any, ys: Any, zs: Any, window: int, before: Any) -> None:
     """Fill in `_nearest` of all samples; 0: there is none."""
     k = len(before)
-    if window == 64:  # a constant trip count is twice as fast
+    if window == 64:  # a constant trip count is faster
         for i in range(k):
             before[i] = _nearest(xs, ys, zs, i, 64)
+    elif window == 16:
+        for i in range(k):
+            before[i] = _nearest(xs, ys, zs, i, 16)
     else:
         for i in range(k):
             before[i] = _nearest(xs, ys, zs, i, window) if window else 0

@@ -86,8 +86,9 @@ def decode(payload: bytes, layout: Layout, channels: Channels) -> Unpacked:
         jump = np.zeros(k + 1, np.intp)
         jump[1:] = np.where(before == 0, 0, np.arange(1, k + 1) - before)
         while jump.any():
-            residuals += residuals[:, jump]
-            jump = jump[jump]
+            for residual in residuals:
+                residual += residual.take(jump)
+            jump = jump.take(jump)
         modulo = ((np.int64(1) << channels.bits) - 1).astype(np.uint32)
         rows = (residuals[:, 1:] + channels.start[:, None]) & modulo[:, None]
     return Unpacked(int(code.max()), position, low, rows)
@@ -159,18 +160,19 @@ def _nearest(top: NDArray[Any], window: int) -> NDArray[np.int64]:
     k = len(top)
     if window == 0:
         return np.zeros(k, np.int64)
-    far = -(1 << 20)  # L1 distances stay below 3 * 2**16
-    padded = np.full((3, window + k), far, np.int32)
+    padded = np.full((3, window + k), -(1 << 25), np.int32)  # far away: L1 distances stay below 3 * 2**22
     padded[:, window:] = top.T
+    padded[:, window:] <<= 6  # leaves room for how far back
     best = np.full(k, np.iinfo(np.int32).max, np.int32)
-    for back in range(1, window + 1):
-        distance = np.abs(padded[:, window:] - padded[:, window - back : -back])
-        packed = distance[0]
-        packed += distance[1]
-        packed += distance[2]
-        packed <<= 6
-        packed |= back - 1
-        np.minimum(best, packed, out=best)
+    gap = np.empty((3, k), np.int32)
+    x, y, z = gap
+    for back in range(window):
+        np.subtract(padded[:, window:], padded[:, window - 1 - back : -1 - back], out=gap)
+        np.abs(gap, out=gap)
+        x += y
+        x += z
+        x += back
+        np.minimum(best, x, out=best)
     before = (best & 63).astype(np.int64) + 1
     before[:1] = 0
     return before
