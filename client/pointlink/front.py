@@ -103,6 +103,7 @@ class Front:
         self.line = Line.open(profile, asyncio.get_running_loop())
         self._listener = listener
         self._profile = profile
+        self._secure = _trust(upstream)
         self._server: asyncio.Server | None = None
         self._ends: set[RelayEnd] = set()
         self._connecting: set[asyncio.Task[None]] = set()
@@ -158,7 +159,7 @@ class Front:
 
     async def _reach(self, far: RelayEnd) -> None:
         try:
-            await _connect(self.upstream, lambda: far, _bytes_in(LOOKAHEAD, self._profile))
+            await _connect(self.upstream, lambda: far, _bytes_in(LOOKAHEAD, self._profile), self._secure)
         except OSError:
             far.fail()
 
@@ -172,7 +173,7 @@ async def check_upstream(upstream: Upstream) -> None:
         Nobody listens there, or somebody without a valid certificate.
     """
     try:
-        (await _connect(upstream, asyncio.Protocol, SMALLEST_BUFFER)).close()
+        (await _connect(upstream, asyncio.Protocol, SMALLEST_BUFFER, _trust(upstream))).close()
     except OSError as error:
         raise Unavailable(
             f"cannot connect to {upstream.authority} ({_reason(error)}); check the address and that this server runs"
@@ -216,6 +217,11 @@ def _bytes_in(seconds: float, profile: Profile) -> int:
     return LARGEST_BUFFER if rate is None else min(LARGEST_BUFFER, max(SMALLEST_BUFFER, int(rate / 8.0 * seconds)))
 
 
+def _trust(upstream: Upstream) -> ssl.SSLContext | None:
+    # Reading the certificates takes tens of milliseconds, in which nothing would move: once, not at every connection.
+    return ssl.create_default_context() if upstream.scheme == "https" else None
+
+
 def _reason(error: OSError) -> str:
     if isinstance(error, TimeoutError):
         return f"nothing within {CONNECT_SECONDS:g} s"
@@ -226,8 +232,9 @@ def _reason(error: OSError) -> str:
     return error.strerror or str(error)
 
 
-async def _connect(upstream: Upstream, protocol: Callable[[], asyncio.Protocol], buffer: int) -> asyncio.BaseTransport:
-    secure = ssl.create_default_context() if upstream.scheme == "https" else None
+async def _connect(
+    upstream: Upstream, protocol: Callable[[], asyncio.Protocol], buffer: int, secure: ssl.SSLContext | None
+) -> asyncio.BaseTransport:
     async with asyncio.timeout(CONNECT_SECONDS):
         sock = await _open_socket(upstream, buffer)
         transport, _ = await asyncio.get_running_loop().create_connection(
