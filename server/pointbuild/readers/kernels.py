@@ -1,4 +1,4 @@
-"""Compiled loops of the readers: where rows of varying length begin, and LZF."""
+"""Compiled loops of the readers: where rows of varying length begin, area vectors of polygons, and LZF."""
 
 from __future__ import annotations
 
@@ -82,6 +82,41 @@ def walk_words(words: NDArray[np.float64], is_list: NDArray[np.bool_], rows: int
                 return row
         at[row, properties] = position
     return rows
+
+
+@numba.njit(cache=True, nogil=True)
+def add_polygons(
+    xyz: NDArray[np.float32], counts: NDArray[np.int64], corners: NDArray[np.int64], sums: NDArray[np.float32]
+) -> None:
+    """Add the area vector of each polygon to the sums at its corners, unless a corner is not finite.
+
+    Parameters
+    ----------
+    xyz, sums : ndarray, (n, 3) float32
+        Vertices; their sums, changed here.
+    counts, corners : ndarray of int64
+        Corners of each polygon, and their vertices one after another, all within `xyz`.
+    """
+    start = 0
+    for count in counts:
+        ax = ay = az = 0.0
+        o = corners[start] if count else 0
+        for k in range(1, count - 1):
+            p, q = corners[start + k], corners[start + k + 1]
+            px, py, pz = np.float64(xyz[p, 0]), np.float64(xyz[p, 1]), np.float64(xyz[p, 2])
+            qx, qy, qz = np.float64(xyz[q, 0]), np.float64(xyz[q, 1]), np.float64(xyz[q, 2])
+            px, py, pz = px - xyz[o, 0], py - xyz[o, 1], pz - xyz[o, 2]
+            qx, qy, qz = qx - xyz[o, 0], qy - xyz[o, 1], qz - xyz[o, 2]
+            ax += py * qz - pz * qy
+            ay += pz * qx - px * qz
+            az += px * qy - py * qx
+        if np.isfinite(ax + ay + az):
+            for k in range(count):
+                corner = corners[start + k]
+                sums[corner, 0] += ax
+                sums[corner, 1] += ay
+                sums[corner, 2] += az
+        start += count
 
 
 @numba.njit(cache=True, nogil=True)

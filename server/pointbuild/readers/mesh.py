@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from lpc.errors import ScanError
 
+from .kernels import add_polygons
 from .scan import unit
 
 
@@ -54,24 +55,7 @@ class VertexNormals:
         if len(corners) and (corners.min() < 0 or corners.max() >= len(self._xyz)):
             bad = corners.min() if corners.min() < 0 else corners.max()
             raise ScanError(f"a face names vertex {bad:,} of {len(self._xyz):,}; the file is damaged")
-        polygons = counts >= 3
-        if not polygons.all():
-            corners = corners[np.repeat(polygons, counts)]
-            counts = counts[polygons]
-        if not len(counts):
-            return
-        starts = np.cumsum(counts) - counts
-        first = np.repeat(starts, counts)
-        following = np.arange(len(corners)) + 1
-        following[starts + counts - 1] = starts
-        position = self._xyz[corners].astype(np.float64)
-        with np.errstate(invalid="ignore"):  # vertices that are not finite
-            position -= self._xyz[corners[first]]
-            area = np.add.reduceat(np.cross(position, position[following]), starts)
-        area[~np.isfinite(area).all(axis=1)] = 0
-        spread = np.repeat(area, counts, axis=0).astype(np.float32)
-        for axis in range(3):
-            np.add.at(self._sums[:, axis], corners, spread[:, axis])
+        add_polygons(self._xyz, counts, corners, self._sums)
 
     def finish(self) -> NDArray[np.float32]:
         """Return unit normals (n, 3), zero for vertices of no face; the positions are let go."""
