@@ -34,9 +34,9 @@ class LocalStore:
     def __init__(self, path: Path) -> None:
         self.name = str(path)
         self.meter: Goodput | None = None
+        if path.is_dir():
+            raise StoreError(f"{path} is a folder: give the path of a .lpc file")
         try:
-            if path.is_dir():
-                raise StoreError(f"{path} is a folder: give the path of a .lpc file")
             self._file = path.open("rb", buffering=0)
         except FileNotFoundError as error:
             raise NotFound(f"{path}: there is no such file") from error
