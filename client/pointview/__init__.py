@@ -1,0 +1,1 @@
+"""Looking at models: camera, refinement, renderers, streaming reports."""

@@ -1,0 +1,292 @@
+"""From an index tree, a camera and what is resident to what to draw and what to ask for (LPC section 4).
+
+A *cut* is the set of nodes to draw: closed under parents, because a node's cloud only adds to those of its ancestors.
+The traversal is LPC's, coarse to fine and stateless, but takes a level of the tree at a time: a level's frontier is an
+array of node numbers and every test below is one numpy expression over it.
+
+1. A node outside the frustum, or whose normals all point away from the eye, is dropped with its branch.
+2. Its *projected spacing* is the apparent size, in pixels, of a sphere of diameter r_j at the point of its bounding
+   sphere nearest to the eye; infinite where the eye is inside. Below the tolerance the node is fine enough.
+3. Otherwise its children refine it: one whose record is unknown makes its page wanted; one that is not resident is
+   wanted itself; one that is resident is visited. A node with a visible child that cannot be drawn yet is *starved*.
+4. Splats show the spacing of the deepest drawn region they lie in: a fine or starved node's own, a refined node's
+   the largest of its drawn children. So there are no holes where data is missing and no fat where it is not.
+
+Nothing here does I/O or reads a clock; equal arguments give equal cuts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .splats import CLOSING, LARGEST
+
+if TYPE_CHECKING:
+    from lpc.index import IndexTree
+
+    from .camera import Camera
+
+Nodes = NDArray[np.int64]
+Priority = Literal["index", "error"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Culled:
+    """Branches dropped by the traversal, by reason."""
+
+    frustum: int = 0
+    backface: int = 0
+    occluded: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cut:
+    """What one frame draws and what it misses.
+
+    Parameters
+    ----------
+    nodes : (n,) int64
+        Nodes to draw, ascending: coarse to fine, and near in space when near in the array.
+    spacing : (n,) float32
+        Spacing that the node's splats must close, model units.
+    splat_px : (n,) float32
+        Side of a splat at the point of the node's sphere nearest to the eye, pixels; samples further away get less.
+    starved : (n,) bool
+        Nodes drawn grown because a visible child is missing.
+    wants : (m,) int64
+        Nodes whose clouds are wanted, most urgent first.
+    pages : (p,) int64
+        Index pages wanted, most urgent first.
+    culled : Culled
+    splats : int
+        Samples in the clouds of `nodes`.
+    max_spacing_px : float
+        Largest projected spacing of a node that is not refined, pixels, at most the larger side of the picture: how
+        coarse the picture is at its worst place. 0 for an empty cut.
+    depth_range : (near, far)
+        Depths between which all samples in front of the eye lie, 0 < near < far; far follows from the nodes, near is at
+        least a millionth of it.
+    """
+
+    nodes: Nodes
+    spacing: NDArray[np.float32]
+    splat_px: NDArray[np.float32]
+    starved: NDArray[np.bool_]
+    wants: Nodes
+    pages: Nodes
+    culled: Culled
+    splats: int
+    max_spacing_px: float
+    depth_range: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class _Level:
+    """The drawn nodes of one level, and what became of their children."""
+
+    nodes: Nodes
+    spacing_px: NDArray[np.float64]
+    children: Nodes  # (n, 2); -1 where there is none or the node is fine enough
+    drawn: NDArray[np.bool_]  # (n, 2)
+    missing: NDArray[np.bool_]  # (n, 2): visible or unknown, and not resident
+    child_spacing_px: NDArray[np.float64]  # (n, 2); NaN where unknown
+
+
+@dataclass(slots=True)
+class _Sieve:
+    """Culling and projected spacing for one camera; counts what it drops."""
+
+    index: IndexTree
+    camera: Camera
+    cull_backfaces: bool
+    frustum: int = 0
+    backface: int = 0
+
+    def look(self, nodes: Nodes) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+        """Return which nodes are visible, and the projected spacing of all, pixels."""
+        index = self.index
+        radius = index.radius[nodes]
+        offset = index.center[nodes] - np.array(self.camera.eye)
+        visible = np.min(offset @ self.camera.frustum_planes().T, axis=1) >= -radius
+        self.frustum += len(nodes) - int(np.count_nonzero(visible))
+        distance = np.sqrt(np.einsum("ij,ij->i", offset, offset))
+        gap = distance - radius
+        outside = gap > 0
+        if self.cull_backfaces:
+            # Every sample is seen within asin(radius / distance) of the centre's direction and has its normal within
+            # the cone's half angle of the axis: all point away if the three angles together stay below a right angle.
+            spread = index.cone_angle[nodes] + np.arcsin(
+                np.divide(radius, distance, out=np.ones_like(radius), where=outside)
+            )
+            along = np.einsum("ij,ij->i", index.cone_axis[nodes], offset)
+            away = visible & (spread < np.pi / 2)
+            away &= along > distance * np.sin(spread)
+            self.backface += int(np.count_nonzero(away))
+            visible &= ~away
+        spacing_px = np.full(len(nodes), np.inf)
+        np.divide(index.spacing[nodes] * self.camera.focal, gap, out=spacing_px, where=outside)
+        return visible, spacing_px
+
+
+def _descend(sieve: _Sieve, tolerance: float, resident: NDArray[np.bool_]) -> Iterator[_Level]:
+    """Traverse the resident part of the tree, a level at a time."""
+    index = sieve.index
+    nodes = np.zeros(1, dtype=np.int64)
+    visible, spacing_px = sieve.look(nodes)
+    nodes, spacing_px = nodes[visible], spacing_px[visible]
+    while len(nodes):
+        children = index.children[nodes].astype(np.int64)
+        children[spacing_px < tolerance] = -1
+        exists = children >= 0
+        known = np.zeros_like(exists)
+        known[exists] = index.known[children[exists]]
+        visible = np.zeros_like(exists)
+        child_spacing_px = np.full(children.shape, np.nan)
+        visible[known], child_spacing_px[known] = sieve.look(children[known])
+        drawn = visible.copy()
+        drawn[visible] = resident[children[visible]]
+        missing = (visible & ~drawn) | (exists & ~known)
+        yield _Level(nodes, spacing_px, children, drawn, missing, child_spacing_px)
+        nodes, spacing_px = children[drawn], child_spacing_px[drawn]
+
+
+def refine(
+    index: IndexTree,
+    camera: Camera,
+    tolerance: float,
+    resident: NDArray[np.bool_],
+    *,
+    priority: Priority = "index",
+    cull_backfaces: bool = True,
+) -> Cut:
+    """Compute the cut of one frame.
+
+    Parameters
+    ----------
+    tolerance : float
+        Projected spacing at which refinement stops, pixels, > 0.
+    resident : (n_nodes,) bool
+        Nodes whose clouds can be drawn now.
+    priority : {"index", "error"}
+        Order of `Cut.wants`: by node number (LPC 4: coarse first, then neighbours), or by the screen error that a byte
+        removes.
+    cull_backfaces : bool
+        False where the normals cannot be trusted to point outward.
+
+    Notes
+    -----
+    Cost is proportional to the visited nodes: the cut and the children of its refined nodes.
+    """
+    if not index.known[0]:
+        return _empty(wants=[], pages=[0], culled=Culled())
+    sieve = _Sieve(index, camera, cull_backfaces)
+    if not resident[0]:
+        visible, _ = sieve.look(np.zeros(1, dtype=np.int64))
+        return _empty(wants=[0] if visible[0] else [], pages=[], culled=_culled(sieve))
+    levels = list(_descend(sieve, tolerance, resident))
+    if not levels:
+        return _empty(wants=[], pages=[], culled=_culled(sieve))
+
+    shown = _shown_spacing(index, levels)
+    nodes = np.concatenate([level.nodes for level in levels])
+    spacing_px = np.concatenate([level.spacing_px for level in levels])
+    starved = np.concatenate([level.missing.any(axis=1) for level in levels])
+    ends = starved | np.concatenate([(level.children < 0).all(axis=1) for level in levels])
+    spacing = np.concatenate(shown)
+    # A splat at the nearest point of the sphere; without bound but the largest where the eye is inside it.
+    splat_px = np.ones(len(nodes))
+    grown = spacing > 0
+    splat_px[grown] = CLOSING * spacing_px[grown] * (spacing[grown] / index.spacing[nodes[grown]])
+    wants, pages = _missing(index, camera, levels, priority)
+    return Cut(
+        nodes=nodes,
+        spacing=spacing.astype(np.float32),
+        splat_px=np.clip(splat_px, 1.0, LARGEST).astype(np.float32),
+        starved=starved,
+        wants=wants,
+        pages=pages,
+        culled=_culled(sieve),
+        splats=int(index.samples[nodes].sum()),
+        max_spacing_px=min(float(np.max(spacing_px[ends], initial=0.0)), float(max(camera.width, camera.height))),
+        depth_range=camera.depth_range(index.center[nodes], index.radius[nodes]),
+    )
+
+
+def count_splats(
+    index: IndexTree, camera: Camera, tolerance: float, resident: NDArray[np.bool_], *, cull_backfaces: bool = True
+) -> int:
+    """Count the samples that `refine` would draw, without the rest of its work (LPC 4, rendering on a budget)."""
+    if not (index.known[0] and resident[0]):
+        return 0
+    sieve = _Sieve(index, camera, cull_backfaces)
+    return sum(int(index.samples[level.nodes].sum()) for level in _descend(sieve, tolerance, resident))
+
+
+def _shown_spacing(index: IndexTree, levels: list[_Level]) -> list[NDArray[np.float64]]:
+    """Spacing of the drawn region around each node's samples, bottom up, model units."""
+    shown: list[NDArray[np.float64]] = []
+    below: NDArray[np.float64] = np.empty(0)
+    for level in reversed(levels):
+        own = index.spacing[level.nodes]
+        largest = np.zeros(level.drawn.shape)
+        largest[level.drawn] = below
+        largest = largest.max(axis=1)
+        # A refined node all of whose children are culled keeps stray samples at the rim: 0, the smallest splat.
+        refined = (level.children >= 0).any(axis=1) & ~level.missing.any(axis=1)
+        below = np.where(refined, np.minimum(largest, own), own)
+        shown.append(below)
+    return shown[::-1]
+
+
+def _missing(index: IndexTree, camera: Camera, levels: list[_Level], priority: Priority) -> tuple[Nodes, Nodes]:
+    """Wanted nodes and wanted pages, most urgent first."""
+    nodes = np.concatenate([level.children[level.missing] for level in levels])
+    if len(nodes) == 0:
+        return nodes, nodes
+    if priority == "error":
+        shown_px = np.concatenate([np.repeat(level.spacing_px, 2).reshape(-1, 2)[level.missing] for level in levels])
+        child_px = np.concatenate([level.child_spacing_px[level.missing] for level in levels])
+        nodes = nodes[np.lexsort((nodes, -_error_per_byte(index, camera, nodes, shown_px, child_px)))]
+    known = index.known[nodes]
+    pages = nodes[~known] // index.header.page_nodes
+    _, first = np.unique(pages, return_index=True)
+    return nodes[known], pages[np.sort(first)]
+
+
+def _error_per_byte(
+    index: IndexTree, camera: Camera, nodes: Nodes, shown_px: NDArray[np.float64], child_px: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Screen error that fetching a node removes, per byte: projected spacing times projected area.
+
+    Unknown nodes come first (infinite): their page costs little and hides what else is wanted.
+    """
+    largest = float(max(camera.width, camera.height))
+    distance = np.linalg.norm(index.center[nodes] - np.array(camera.eye), axis=1)
+    radius_px = np.minimum(index.radius[nodes] * camera.focal / np.maximum(distance, 1e-300), largest)
+    removed = np.minimum(shown_px, largest) - np.minimum(child_px, largest)
+    score = np.maximum(removed, 0.0) * radius_px**2 / np.maximum(index.size[nodes], 1)
+    return np.where(index.known[nodes], score, np.inf)
+
+
+def _culled(sieve: _Sieve) -> Culled:
+    return Culled(frustum=sieve.frustum, backface=sieve.backface)
+
+
+def _empty(*, wants: list[int], pages: list[int], culled: Culled) -> Cut:
+    return Cut(
+        nodes=np.empty(0, dtype=np.int64),
+        spacing=np.empty(0, dtype=np.float32),
+        splat_px=np.empty(0, dtype=np.float32),
+        starved=np.empty(0, dtype=bool),
+        wants=np.array(wants, dtype=np.int64),
+        pages=np.array(pages, dtype=np.int64),
+        culled=culled,
+        splats=0,
+        max_spacing_px=0.0,
+        depth_range=(1.0, 2.0),
+    )
