@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import zstandard
-from numpy.typing import NDArray
 from plyfile import PlyData
 from scipy.spatial import cKDTree
 
@@ -23,6 +22,11 @@ from lpc.codec import decode_cloud, encode_cloud
 from lpc.lattice import position_step, quantise
 from lpc.octahedral import encode_normals
 from lpc.payload import RAW_BITS, parse_layout
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from numpy.typing import NDArray
 
 NORMAL = Attribute(name="normal", kind="normal", dtype="<f4", bits=8)
 COLOR = Attribute(name="color", kind="color", dtype="|u1", bits=8)
@@ -70,9 +74,7 @@ def face_normals(xyz: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[
     """Sum of the normals of a vertex' faces, weighted by area."""
     a, b, c = (xyz[faces[:, corner]] for corner in range(3))
     area = np.cross(b - a, c - a)
-    return np.stack(
-        [np.bincount(faces.ravel(), np.repeat(area[:, axis], 3), len(xyz)) for axis in range(3)], axis=1
-    )
+    return np.stack([np.bincount(faces.ravel(), np.repeat(area[:, axis], 3), len(xyz)) for axis in range(3)], axis=1)
 
 
 def estimated_normals(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -148,9 +150,7 @@ def measure(path: Path, size: int, effort: str, repeats: int, with_color: bool) 
     schema: Schema = (NORMAL,)
     if with_color and color is not None:
         schema, codes["color"] = (NORMAL, COLOR), color
-    parts = [
-        (lattice[which], {name: code[which] for name, code in codes.items()}) for which in clouds(xyz, size, 2)
-    ]
+    parts = [(lattice[which], {name: code[which] for name, code in codes.items()}) for which in clouds(xyz, size, 2)]
     counts = [len(part) for part, _ in parts]
 
     def encode() -> list[bytes]:
@@ -188,8 +188,8 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args()
     print(f"{'':41} bits a sample {'':29} us/sample   decoded, M samples/s of CPU")
-    print(f"{'scan':24} {'samples':>9} {'clouds':>6} {'position':>8} {'normal':>8} {'color':>8} {'header':>8} {'total':>8}"
-          f" {'encode':>7} {'compil.':>7} {'numpy':>7}")  # fmt: skip
+    streams = " ".join(f"{name:>8}" for name in ("position", "normal", "color", "header", "total"))
+    print(f"{'scan':24} {'samples':>9} {'clouds':>6} {streams} {'encode':>7} {'compil.':>7} {'numpy':>7}")
     for name in options.names:
         measure(options.folder / name, options.cloud_size, options.effort, options.repeats, options.color)
 

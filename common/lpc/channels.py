@@ -104,8 +104,7 @@ def to_channels(codes: Mapping[str, NDArray[Any]], schema: Schema, samples: int)
     ValueError
         If an attribute is missing or not of that shape, or a code is too large.
     """
-    channels = channels_of(schema)
-    rows = np.empty((len(channels), samples), np.uint32)
+    rows = np.empty((len(channels_of(schema)), samples), np.uint32)
     at = 0
     for attribute in schema:
         values = codes.get(attribute.name)
@@ -113,6 +112,9 @@ def to_channels(codes: Mapping[str, NDArray[Any]], schema: Schema, samples: int)
         if values is None or values.shape != shape:
             found = "is missing" if values is None else f"has shape {values.shape}"
             raise ValueError(f"codes of {attribute.name} must have shape {shape}: it {found}")
+        top = (1 << attribute.bits) - (2 if attribute.kind == "normal" else 1)
+        if samples and not 0 <= int(values.min()) <= int(values.max()) <= top:
+            raise ValueError(f"a code of {attribute.name} is not between 0 and {top}")
         if attribute.kind == "normal":
             rows[at], rows[at + 1] = values[:, 0], values[:, 1]
             at += 2
@@ -126,11 +128,6 @@ def to_channels(codes: Mapping[str, NDArray[Any]], schema: Schema, samples: int)
         else:
             rows[at] = values
             at += 1
-    top = (np.int64(1) << channels.bits) - 1
-    top[channels.normals[:, 0]] -= 1
-    top[channels.normals[:, 0] + 1] -= 1
-    if samples and (rows.max(axis=1) > top).any():
-        raise ValueError("a code is larger than its attribute's bits allow")
     return rows
 
 

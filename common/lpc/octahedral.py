@@ -80,10 +80,8 @@ def _nearest_codes(normals: NDArray[np.float64], bits: int) -> NDArray[np.float6
 def decode_normals(codes: NDArray[Any], bits: int = 8) -> NDArray[np.float32]:
     """Give unit normals of (n, 2) codes, (n, 3) float32; the zero vector for (0, 0)."""
     _code_dtype(bits)
-    half = np.float32((1 << (bits - 1)) - 1)
-    p, q, w = _unfold(codes[:, 0].astype(np.float32) / half - np.float32(1), codes[:, 1].astype(np.float32) / half - 1)
-    normals = np.stack([p, q, w], axis=1)
-    normals /= np.sqrt(p * p + q * q + w * w)[:, None]
+    normals = np.ascontiguousarray(unfold_codes(codes.T, (1 << (bits - 1)) - 1).T, np.float32)
+    normals /= np.sqrt(np.einsum("ij,ij->i", normals, normals))[:, None]
     normals[(codes == 0).all(axis=1)] = 0.0
     return normals
 

@@ -90,7 +90,7 @@ class Layout:
 def pack_header(packed: Packed, window: int) -> bytes:
     """Return the bytes before the raw streams."""
     corner_bytes = max((corner ^ (corner >> 63)).bit_length() // 8 + 1 for corner in packed.origin)
-    head = HEADER.pack(CODEC, packed.rotation, packed.turn, packed.nbits, packed.shift, window, corner_bytes, 0)
+    head = HEADER.pack(CODEC, packed.rotation, packed.nbits, packed.shift, window, packed.turn, corner_bytes, 0)
     return head + b"".join(corner.to_bytes(corner_bytes, "little", signed=True) for corner in packed.origin)
 
 
@@ -129,7 +129,7 @@ def parse_layout(payload: bytes, *, samples: int, channels: Channels) -> Layout:
     streams = 1 + len(channels)
     if len(payload) < HEADER.size + streams * samples:
         raise Corrupt(f"cloud: {len(payload)} bytes cannot hold {samples} samples")
-    codec, rotation, turn, nbits, shift, window, corner_bytes, reserved = HEADER.unpack_from(payload)
+    codec, rotation, nbits, shift, window, turn, corner_bytes, reserved = HEADER.unpack_from(payload)
     if codec != CODEC:
         raise Corrupt(f"cloud: codec {codec} is unknown")
     if rotation > 2 or turn >= TURNS or window > MAX_WINDOW or corner_bytes > MAX_CORNER_BYTES or reserved:
