@@ -62,14 +62,14 @@ def _nearest_codes(normals: NDArray[np.float64], bits: int) -> NDArray[np.float6
     folded = z < 0.0
     u, v = np.where(folded, (1.0 - np.abs(v)) * _sign(u), u), np.where(folded, (1.0 - np.abs(u)) * _sign(v), v)
     low_u, low_v = np.floor((u + 1.0) * half), np.floor((v + 1.0) * half)
-    best = np.full(len(unit), -2.0)
+    best, best_square = np.full(len(unit), -1.0), np.ones(len(unit))
     codes = np.zeros((len(unit), 2))
     for corner in range(4):
         a, b = np.minimum(low_u + (corner & 1), 2.0 * half), np.minimum(low_v + (corner >> 1), 2.0 * half)
         p, q, w = _unfold(a / half - 1.0, b / half - 1.0)
-        cosine = (p * x + q * y + w * z) / np.sqrt(p * p + q * q + w * w)
-        better = cosine > best
-        best[better] = cosine[better]
+        dot, square = np.maximum(p * x + q * y + w * z, 0.0) ** 2, p * p + q * q + w * w
+        better = dot * best_square > best * square  # cos^2 without a division
+        best[better], best_square[better] = dot[better], square[better]
         codes[better, 0], codes[better, 1] = a[better], b[better]
     edge = (codes == 0.0) | (codes == 2.0 * half)  # where two codes or four mean one direction
     codes = np.where(edge[:, ::-1], np.maximum(codes, 2.0 * half - codes), codes)

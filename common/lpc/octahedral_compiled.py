@@ -35,7 +35,7 @@ def _nearest_codes(normals: Any, half: float, codes: Any) -> None:
                 (1.0 - abs(x / size)) * (1.0 if y >= 0.0 else -1.0),
             )
         low_u, low_v = np.floor((u + 1.0) * half), np.floor((v + 1.0) * half)
-        best = -2.0
+        best, best_square = -1.0, 1.0
         for corner in range(4):
             a, b = min(low_u + (corner & 1), 2.0 * half), min(low_v + (corner >> 1), 2.0 * half)
             p, q = a / half - 1.0, b / half - 1.0
@@ -45,9 +45,10 @@ def _nearest_codes(normals: Any, half: float, codes: Any) -> None:
                     (1.0 - abs(q)) * (1.0 if p >= 0.0 else -1.0),
                     (1.0 - abs(p)) * (1.0 if q >= 0.0 else -1.0),
                 )
-            cosine = (p * x + q * y + w * z) / np.sqrt(p * p + q * q + w * w)
-            if cosine > best:
-                best = cosine
+            dot, square = max(p * x + q * y + w * z, 0.0), p * p + q * q + w * w
+            dot *= dot
+            if dot * best_square > best * square:
+                best, best_square = dot, square
                 codes[i, 0], codes[i, 1] = np.uint16(a), np.uint16(b)
         a, b = float(codes[i, 0]), float(codes[i, 1])
         if b in (0.0, 2.0 * half):
