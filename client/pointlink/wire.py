@@ -171,7 +171,7 @@ class Flow:
         self._offer()
 
     def drop(self) -> None:
-        """Forget what has not entered the queue, deliver nothing more; what is in the queue still takes its time."""
+        """Forget what has not entered the queue and take no more; what is in the queue still takes its time."""
         self._dropped = True
         self._buffer.clear()
         self._offered = 0
@@ -199,8 +199,7 @@ class Flow:
 
     def arrive(self, data: bytes) -> None:
         """Deliver (called by the wire)."""
-        if not self._dropped:
-            self._on_data(data)
+        self._on_data(data)
 
     def _end_if_empty(self) -> None:
         how = self._ending

@@ -144,6 +144,38 @@ async def test_the_server_hears_its_own_name_and_gets_bodies_unchanged() -> None
     assert all(own in head and b"wrong" not in head for head in heads)
 
 
+async def test_half_a_head_is_not_lost_when_the_client_stops() -> None:
+    got: list[bytes] = []
+
+    async def record(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        got.append(await reader.read())
+        await hang_up(writer)
+
+    async with front_of(record, scheme="http") as front:
+        reader, writer = await connect(front)
+        writer.write(b"GET /never/ended HTT")
+        writer.write_eof()
+        assert await reader.read() == b""
+        await hang_up(writer)
+    assert got == [b"GET /never/ended HTT"]
+
+
+async def test_connecting_costs_a_round_trip_and_asking_another() -> None:
+    async def echo(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(await reader.readexactly(1))
+        await hang_up(writer)
+
+    async with front_of(echo) as front:
+        loop = asyncio.get_running_loop()
+        began = loop.time()
+        reader, writer = await connect(front)
+        writer.write(b"x")
+        await reader.readexactly(1)
+        # Not earlier is certain on any machine; how much later is benchmarks/link.py's to measure.
+        assert loop.time() - began >= 2 * QUICK.rtt - 1e-6
+        await hang_up(writer)
+
+
 async def test_ranges_of_a_real_origin_come_through() -> None:
     body = random.Random(5).randbytes(300_000)
     server = await serve_origin(Origin(resources={"/m.lpc": Resource.from_bytes(body)}))

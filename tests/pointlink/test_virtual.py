@@ -88,6 +88,7 @@ def test_executor_work_is_done_at_once_and_its_errors_come_back() -> None:
 
 def test_waiting_for_ever_is_an_error_that_names_the_task_and_the_place() -> None:
     async def stuck_here() -> None:
+        asyncio.get_running_loop().call_later(100, lambda: None).cancel()
         await asyncio.sleep(1.5)
         await asyncio.Event().wait()
 
