@@ -99,6 +99,12 @@ class Model:
         """What ``pointstream info --json`` prints."""
         return info_dict(self.header, length=self._reader.length)
 
+    @property
+    def attributes(self) -> dict[str, np.dtype[Any]]:
+        """Names of what every sample carries and the dtypes of the values, constants included."""
+        stored = {item.name: np.dtype(item.dtype) for item in self.header.attributes}
+        return stored | {name: constant.fill(0).dtype for name, constant in self.header.constants.items()}
+
     def read(
         self, *, bounds: Sequence[float] | None = None, spacing: float | None = None, level: int | None = None
     ) -> PointBatch:

@@ -1,0 +1,182 @@
+"""``pointstream info``, ``verify`` and ``export``."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+import time
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lpc.errors import ScanError
+
+from .model import open_model
+from .progress import progress
+from .reading import Reader
+from .stores import open_store
+from .verify import Scan, VerifyReport
+from .verify import verify as verify_reader
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from lpc.points import PointBatch
+
+    from .model import Model
+
+JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+
+
+@click.command()
+@click.argument("model")
+@JSON
+def info(model: str, as_json: bool) -> None:
+    """Say what MODEL, a path or an http(s) address, holds; reads 64 KiB of it."""
+    with open_model(model) as opened:
+        facts = opened.info
+    if as_json:
+        click.echo(json.dumps(facts))
+    else:
+        _print_info(facts)
+
+
+@click.command()
+@click.argument("model")
+@click.option("--against", "scans", multiple=True, type=click.Path(), help="A scan it was built from; more may follow.")
+@click.argument("more", nargs=-1, type=click.Path())
+@JSON
+def verify(model: str, scans: tuple[str, ...], more: tuple[str, ...], as_json: bool) -> None:
+    """Check every page and cloud of MODEL; with --against SCAN..., that it holds exactly the samples of these scans."""
+    if more and not scans:
+        raise click.UsageError(f"{more[0]}: scans to compare with stand after --against")
+    open_scan = _scan_reader() if scans else None
+    opened = [open_scan(path) for path in (*scans, *more)] if open_scan is not None else []
+    report = asyncio.run(_verify(model, opened))
+    if as_json:
+        click.echo(json.dumps(report.to_json()))
+    else:
+        _print_report(report)
+    if not report.ok:
+        sys.exit(1)
+
+
+def _parse_bounds(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[float, ...] | None:
+    if value is None:
+        return None
+    try:
+        bounds = tuple(float(part) for part in value.split(","))
+    except ValueError as error:
+        raise click.BadParameter(f"{value!r} is not six numbers X0,Y0,Z0,X1,Y1,Z1", ctx, param) from error
+    if len(bounds) != 6 or not all(low <= high for low, high in zip(bounds[:3], bounds[3:], strict=True)):
+        raise click.BadParameter(f"{value!r} is not X0,Y0,Z0,X1,Y1,Z1 with X0 <= X1 and so on", ctx, param)
+    return bounds
+
+
+@click.command()
+@click.argument("model")
+@click.argument("out", type=click.Path(dir_okay=False, path_type=Path))
+@click.option("--level", type=click.IntRange(min=0), help="Deepest level of the tree, 0 for the root alone.")
+@click.option("--spacing", type=click.FloatRange(min=0, min_open=True), help="Detail that is enough, model units.")
+@click.option("--bounds", callback=_parse_bounds, help="X0,Y0,Z0,X1,Y1,Z1 in model units: only samples inside.")
+def export(model: str, out: Path, level: int | None, spacing: float | None, bounds: tuple[float, ...] | None) -> None:
+    """Write the samples of MODEL to OUT.{ply,las,laz,xyz,npz}, every one once."""
+    if level is not None and spacing is not None:
+        raise click.UsageError("give --level or --spacing, not both")
+    from .writers import write_points
+
+    with open_model(model) as opened:
+        header = opened.header
+        choice = {"level": level, "spacing": spacing, "bounds": bounds}
+        total = opened.count(**choice)  # type: ignore[arg-type]
+        # Counts stand at the head of most formats, so what the bounds cut is counted first.
+        count = total if bounds is None else sum(map(len, _batches(opened, "counting", total, choice)))
+        write_points(
+            out,
+            _batches(opened, "exporting", count, choice),
+            count=count,
+            crs=header.crs,
+            attributes=opened.attributes,
+            position_error=header.position_error,
+        )
+    click.echo(f"{out}: {count} samples", err=True)
+
+
+def _batches(model: Model, label: str, total: int, choice: dict[str, Any]) -> Iterator[PointBatch]:
+    with progress(label, total) as advance:
+        for batch in model.batches(**choice):
+            yield batch
+            advance(len(batch))
+
+
+async def _verify(target: str, scans: list[Scan]) -> VerifyReport:
+    store = open_store(target, clock=time.monotonic)
+    try:
+        reader = await Reader.open(store)
+        with progress("checking clouds", reader.index.header.nodes) as advance:
+            return await verify_reader(reader, scans, advance=advance)
+    finally:
+        await store.close()
+
+
+def _scan_reader() -> Callable[[str], Scan]:
+    """Find what reads scans: another package's trade, met by the name of an entry point."""
+    for point in entry_points(group="pointstream.readers", name="scan"):
+        return point.load()
+    raise ScanError("no reader of scans is installed: pip install 'pointstream[server]'")
+
+
+def _print_info(facts: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    for name, text in _rows(facts):
+        table.add_row(name, text)
+    Console(highlight=False).print(table)
+
+
+def _rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    low, high = facts["bounds"]
+    bits = facts["bits_per_sample"]
+    yield "format", facts["format"]
+    yield "samples", f"{facts['samples']:,} in {facts['clouds']:,} clouds of at most {facts['cloud_size']:,}"
+    yield "levels", str(facts["levels"])
+    yield "bytes", f"{facts['bytes']:,}"
+    if not facts["complete"]:
+        yield "incomplete", f"only the first {facts['bytes_here']:,} bytes are here: a coarser model"
+    yield "bits per sample", ", ".join(f"{name} {value:.2f}" for name, value in bits.items() if value)
+    yield "spacing", f"{facts['spacing']:.6g}"
+    yield "spacing, stored / LPC", " ".join(f"{ratio:.3f}" for ratio in facts["spacing_ratio"]) + "  (5%, 50%, 95%)"
+    yield "position error", f"at most {facts['position_error']:.6g}"
+    yield "from", " ".join(f"{value:.10g}" for value in low)
+    yield "to", " ".join(f"{value:.10g}" for value in high)
+    yield "attributes", ", ".join(facts["attributes"]) or "none"
+    for name, value in facts["constants"].items():
+        yield f"{name} everywhere", str(value)
+    yield "crs", facts["crs"] or "none"
+    for name, why in facts["left_out"].items():
+        yield f"left out: {name}", why
+    for why, count in facts["rejected"].items():
+        if count:
+            yield f"rejected: {why}", f"{count:,} records"
+    yield "build", facts["digest"]
+
+
+def _print_report(report: VerifyReport) -> None:
+    click.echo(f"{report.clouds_checked} of {report.clouds} clouds checked")
+    if (match := report.match) is not None:
+        click.echo(
+            f"samples of the scans {match.samples_in}, of the model {match.samples_out}, missing {match.missing}"
+        )
+        click.echo(f"largest position error {match.max_position_error:.6g}")
+        if match.max_normal_error_degrees is not None:
+            click.echo(f"largest normal error {match.max_normal_error_degrees:.4f} degrees")
+    for problem in report.problems:
+        click.echo(f"problem: {problem}", err=True)
+    click.echo("ok" if report.ok else "not ok")
