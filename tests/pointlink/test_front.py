@@ -29,10 +29,10 @@ Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]
 
 
 @contextlib.asynccontextmanager
-async def front_of(handler: Handler, scheme: str = "tcp") -> AsyncIterator[Front]:
+async def front_of(handler: Handler, scheme: str = "tcp", profile: Profile = QUICK) -> AsyncIterator[Front]:
     server = await asyncio.start_server(handler, "127.0.0.1", 0)
     upstream = Upstream(scheme=scheme, host="127.0.0.1", port=server.sockets[0].getsockname()[1], path="/")
-    async with server, await serve_front(upstream, QUICK) as front:
+    async with server, await serve_front(upstream, profile) as front:
         yield front
 
 
@@ -81,7 +81,7 @@ async def test_a_reset_by_the_server_is_a_reset_for_the_client() -> None:
         await hang_up(writer)
 
 
-async def test_a_client_that_goes_away_is_noticed_by_the_server() -> None:
+async def test_a_client_that_goes_away_is_noticed_by_the_server_and_frees_the_link() -> None:
     noticed = asyncio.Event()
 
     async def endless(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -93,11 +93,15 @@ async def test_a_client_that_goes_away_is_noticed_by_the_server() -> None:
             noticed.set()
         await hang_up(writer)
 
-    async with front_of(endless) as front:
+    slow = Profile(down_rate=100e3, up_rate=400e6, rtt=0.002, queue=32 * 1024)
+    async with front_of(endless, profile=slow) as front:
         reader, writer = await connect(front)
-        await reader.readexactly(100_000)
+        await reader.readexactly(1)
+        assert front.line.down.link.next_room is not None
         writer.transport.abort()
         await noticed.wait()
+        # What is in the queue takes seconds more; what stood before it is gone.
+        assert front.line.down.link.next_room is None
 
 
 async def test_a_client_that_does_not_read_holds_the_server_back() -> None:
