@@ -5,13 +5,9 @@ When the host changes the model, all of this is replaced by a new one in one ste
 
 from __future__ import annotations
 
-import zlib
 from typing import TYPE_CHECKING
 
 import numpy as np
-
-from lpc.codec import decode_cloud
-from lpc.errors import Corrupt
 
 from .residency import Residency
 from .scheduler import Item
@@ -126,19 +122,3 @@ class Build:
             if item.stop <= min(stop, self.length):
                 items.append(item)
         return items
-
-
-def decode_checked(data: bytes, *, node: int, index: IndexTree) -> Cloud:
-    """Check the bytes of a cloud against its record and decode them; runs in any thread.
-
-    Raises
-    ------
-    Corrupt
-        Naming the node.
-    """
-    if zlib.crc32(data) != int(index.crc[node]):
-        raise Corrupt(f"cloud {node}: checksum differs, the file or the line damaged it")
-    try:
-        return decode_cloud(data, samples=int(index.samples[node]), schema=index.header.attributes)
-    except Corrupt as error:
-        raise Corrupt(f"cloud {node}: {error}") from error

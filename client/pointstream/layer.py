@@ -7,23 +7,24 @@ event loop: requests, arrivals, retries. Decoding runs in threads. See README.md
 from __future__ import annotations
 
 import asyncio
-from collections import deque
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lpc.errors import FormatError, LpcError, ModelChanged, StoreError, Unavailable
+from lpc.errors import Corrupt, FormatError, LpcError, ModelChanged, StoreError, Unavailable
 from lpc.header import HEADER_PROBE
 from lpc.ranges import ByteRange
 
 from .arrivals import Assembly
-from .build import Build, decode_checked
+from .build import Build
+from .decoding import Decoder
 from .opening import Opening, add_page
+from .recovery import Recovery, RecoveryOptions
 from .scheduler import Item, LinkState, Request, Scheduler, SchedulerOptions
-from .stats import ErrorLog, LayerStats, WantedTime
+from .stats import ErrorLog, LayerStats
+from .wanted import Wanted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
@@ -50,21 +51,16 @@ class LayerOptions:
         Bytes that have arrived and wait to be decoded, at most, before more are asked for.
     tries : int
         Fetches of a cloud or page that fails its checks, before it stays missing.
-    reloads, reload_seconds : int, float
-        Changes of the model that are followed within that time; more, and the host is given up.
-    longest_pause : float
-        Seconds; pauses after a host failed double from 1 s up to this.
     scheduler : SchedulerOptions
+    recovery : RecoveryOptions
     """
 
     capacity: int = 512 << 20
     decode_threads: int = 2
     decode_backlog: int = 1 << 20
     tries: int = 3
-    reloads: int = 3
-    reload_seconds: float = 60.0
-    longest_pause: float = 30.0
     scheduler: SchedulerOptions = field(default_factory=SchedulerOptions)
+    recovery: RecoveryOptions = field(default_factory=RecoveryOptions)
 
 
 class AccessLayer:
@@ -79,21 +75,13 @@ class AccessLayer:
         self._build: Build | None = None
         self._builds = 0
         self._scheduler = Scheduler(options.scheduler)
-        self._executor = ThreadPoolExecutor(options.decode_threads, thread_name_prefix="decode")
-        self._tasks: set[asyncio.Task[None]] = set()
-        self._backlog = 0
-        self._decodes = 0
-        self._quiet = asyncio.Event()
-        self._wanted: NDArray[np.bool_] = np.zeros(0, dtype=bool)
-        self._wanting = 0
-        self._wanted_pages: set[int] = set()
-        self._wanted_time = WantedTime(clock())
+        self._decoder = Decoder(options.decode_threads, clock)
+        self._recovery = Recovery(options.recovery)
+        self._wanted = Wanted(clock())
         self._errors = ErrorLog()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._quiet = asyncio.Event()
         self._received = self._requests = self._payload = 0
-        self._decode_seconds = 0.0
-        self._failures = 0
-        self._paused_until = -float("inf")
-        self._reloads: deque[float] = deque()
         self._stale = self._probing = self._stopped = False
 
     @classmethod
@@ -142,6 +130,11 @@ class AccessLayer:
         return self._now.residency.resident
 
     @property
+    def absent(self) -> NDArray[np.bool_]:
+        """(nodes,) bool: known nodes that will never come: the file was cut short, or they are damaged."""
+        return self._now.absent
+
+    @property
     def stats(self) -> LayerStats:
         """What was counted so far."""
         now, meter, residency = self._clock(), self._store.meter, self._now.residency
@@ -158,8 +151,8 @@ class AccessLayer:
             resident_bytes=residency.bytes,
             over_bytes=residency.over,
             evicted=residency.evicted,
-            wanted_seconds=self._wanted_time.seconds(now),
-            decode_seconds=self._decode_seconds,
+            wanted_seconds=self._wanted.seconds(now),
+            decode_seconds=self._decoder.seconds,
             build=self._builds,
             errors=self._errors.reports,
         )
@@ -186,11 +179,12 @@ class AccessLayer:
         """
         build = self._now
         build.drop(build.residency.pin(np.asarray(pinned, dtype=np.int64)))
+        if self._stopped:
+            return
         pages, nodes = build.missing(np.asarray(wants, dtype=np.int64))
-        self._note_wanted(pages, nodes)
+        self._wanted.frame(self._clock(), pages, nodes)
         nodes = nodes[~build.busy[nodes]]
-        items = [build.page_item(page) for page in pages.tolist()]
-        places = np.array(items, dtype=np.int64).reshape(-1, 3)
+        places = np.array([build.page_item(page) for page in pages.tolist()], dtype=np.int64).reshape(-1, 3)
         start = build.index.offset[nodes]
         self._scheduler.offer(
             np.concatenate([places[:, 0], nodes]),
@@ -201,7 +195,7 @@ class AccessLayer:
 
     async def idle(self) -> None:
         """Wait until nothing is in flight and nothing is being decoded."""
-        while self._tasks or self._decodes:
+        while self._tasks or self._decoder.pending:
             self._quiet.clear()
             await self._quiet.wait()
 
@@ -211,7 +205,7 @@ class AccessLayer:
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        self._executor.shutdown(cancel_futures=True)
+        self._decoder.close()
         await self._store.close()
 
     @property
@@ -219,36 +213,16 @@ class AccessLayer:
         assert self._build is not None
         return self._build
 
-    def _note_wanted(self, pages: NDArray[np.int64], nodes: NDArray[np.int64]) -> None:
-        self._wanted[:] = False
-        self._wanted[nodes] = True
-        self._wanted_pages = set(pages.tolist())
-        self._wanting = len(nodes)
-        self._wanted_time.set(self._clock(), bool(self._wanting or self._wanted_pages))
-
-    def _came(self, key: int) -> None:
-        """Note that a wanted object is here, or never will be."""
-        if key < 0:
-            self._wanted_pages.discard(~key)
-        elif self._wanted[key]:
-            self._wanted[key] = False
-            self._wanting -= 1
-        if not (self._wanting or self._wanted_pages):
-            self._wanted_time.set(self._clock(), wanting=False)
-
     def _issue(self) -> None:
         now = self._clock()
-        if (
-            self._stopped
-            or now < self._paused_until
-            or self._backlog > self._options.decode_backlog
-            or self._now.residency.full
-        ):
+        if self._stopped or self._recovery.paused(now):
             return
         if self._stale:
             if not self._probing:
                 self._probing = True
                 self._spawn(self._probe())
+            return
+        if self._decoder.backlog > self._options.decode_backlog or self._now.residency.full:
             return
         meter = self._store.meter
         link = None if meter is None else LinkState(meter.admission(now), meter.rtt, meter.measured)
@@ -263,11 +237,11 @@ class AccessLayer:
     def _done(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
         self._settle()
-        if not task.cancelled() and (error := task.exception()) is not None:
-            raise error  # a bug: shown by the loop's exception handler, never swallowed
+        if not task.cancelled():
+            task.result()  # an error here is a bug: shown by the loop's exception handler, never swallowed
 
     def _settle(self) -> None:
-        if not self._tasks and not self._decodes:
+        if not self._tasks and not self._decoder.pending:
             self._quiet.set()
 
     async def _probe(self, opened: asyncio.Future[None] | None = None) -> None:
@@ -296,10 +270,10 @@ class AccessLayer:
             while build is None:  # the header is larger than the probe
                 await self._store.read(ByteRange(len(assembly.data), opening.needed), sink)
                 look(ended=len(assembly.data) < opening.needed)
-            self._stale = False
+            self._recovery.answered()
         except LpcError as error:
             if opened is None or opened.done():
-                self._host_failed(error)
+                self._failed(error)
             else:
                 opened.set_exception(error)
         finally:
@@ -312,16 +286,15 @@ class AccessLayer:
         """Take what was just opened for the model, in one step, if it is another build than the one at hand."""
         assert opening.index is not None
         header = opening.index.header
-        length = header.bytes if self._store.length is None else min(header.bytes, self._store.length)
         self._payload += opening.needed
         self._stale = False
         if self._build is not None and self._build.index.header.digest == header.digest:
             self._store.forget(distrust_tags=True)  # the tag changed and the model did not
             return self._build
+        length = header.bytes if self._store.length is None else min(header.bytes, self._store.length)
         self._builds += 1
         self._build = Build(opening.index, capacity=self._options.capacity, length=length)
-        self._wanted = np.zeros(header.nodes, dtype=bool)
-        self._wanting, self._wanted_pages = 0, set()
+        self._wanted.begin(header.nodes)
         return self._build
 
     def _claim(self, build: Build, request: Request, assembly: Assembly, nodes: NDArray[np.int64]) -> None:
@@ -339,11 +312,11 @@ class AccessLayer:
 
         try:
             data = await self._store.read(request.range, sink)
-            self._failures = 0
+            self._recovery.answered()
             if len(data) < request.range.size:
                 build.ends_at(request.range.start + len(data))
         except LpcError as error:
-            self._host_failed(error)
+            self._failed(error)
         finally:
             scheduler.ended(request)
         self._issue()
@@ -363,8 +336,10 @@ class AccessLayer:
             arrived = True
             if item.key < 0:
                 self._page_arrived(build, ~item.key, data, request, assembly)
-            elif not self._now.residency.resident[item.key] and not build.busy[item.key]:
-                self._decode(build, item, data)
+            elif not build.residency.resident[item.key] and not build.busy[item.key]:
+                build.busy[item.key] = True
+                done = partial(self._decoded, build, item)
+                self._decoder.decode(data, node=item.key, index=build.index, done=done)
         if arrived:
             self._issue()
 
@@ -372,61 +347,38 @@ class AccessLayer:
         try:
             add_page(build.index, page, data)
         except ModelChanged as error:
-            self._host_failed(error)
+            self._failed(error)
             return
         except FormatError as error:
             self._damaged(build, ~page, error)
             return
         self._payload += len(data)
         build.page_came()
-        self._came(~page)
+        self._wanted.came(self._clock(), ~page)
         if request.range.start == 0:  # the probe: what else the new page shows to lie inside it
             first = page * build.index.header.page_nodes
             nodes = np.arange(first, min(first + build.index.header.page_nodes, len(build.index)))
             self._claim(build, request, assembly, nodes)
 
-    def _decode(self, build: Build, item: Item, data: bytes) -> None:
-        build.busy[item.key] = True
-        self._backlog += len(data)
-        self._decodes += 1
-        loop = asyncio.get_running_loop()
-        work = loop.run_in_executor(self._executor, self._decode_timed, data, item.key, build.index)
-        work.add_done_callback(partial(self._decoded, build, item))
-
-    def _decode_timed(self, data: bytes, node: int, index: IndexTree) -> tuple[Cloud, float]:
-        start = self._clock()
-        cloud = decode_checked(data, node=node, index=index)
-        return cloud, self._clock() - start
-
-    def _decoded(self, build: Build, item: Item, work: asyncio.Future[tuple[Cloud, float]]) -> None:
-        size = item.stop - item.start
-        self._backlog -= size
-        self._decodes -= 1
+    def _decoded(self, build: Build, item: Item, cloud: Cloud | Corrupt) -> None:
         build.busy[item.key] = False
         self._settle()
-        if work.cancelled() or build is not self._build:
-            if not work.cancelled():
-                work.exception()  # of a build that is gone
+        if build is not self._build:
             return
-        error = work.exception()
-        if isinstance(error, FormatError):
-            self._damaged(build, item.key, error)
-        elif error is not None:
-            raise error  # a bug: shown by the loop's exception handler, never swallowed
+        if isinstance(cloud, Corrupt):
+            self._damaged(build, item.key, cloud)
         else:
-            cloud, seconds = work.result()
-            self._decode_seconds += seconds
-            self._payload += size
+            self._payload += item.stop - item.start
             build.add(item.key, cloud)
-            self._came(item.key)
+            self._wanted.came(self._clock(), item.key)
         self._issue()
 
     def _damaged(self, build: Build, key: int, error: FormatError) -> None:
         if build.failed(key, self._options.tries):
             self._errors.add("page" if key < 0 else "cloud", f"{error}; it stays missing")
-            self._came(key)
+            self._wanted.came(self._clock(), key)
 
-    def _host_failed(self, error: LpcError) -> None:
+    def _failed(self, error: LpcError) -> None:
         """Follow a change of the model, wait for a host that is down, give up on one that refuses."""
         now = self._clock()
         if isinstance(error, ModelChanged):
@@ -434,23 +386,17 @@ class AccessLayer:
             return
         self._errors.add("host" if isinstance(error, StoreError) else "model", str(error))
         if isinstance(error, Unavailable):
-            self._paused_until = now + min(2.0**self._failures, self._options.longest_pause)
-            self._failures += 1
+            self._recovery.failed(now)
         else:
-            self._stop()
+            self._stop(now)
 
     def _reload(self, now: float, error: ModelChanged) -> None:
         """Cut off all requests of this build and open what stands there now; this build is drawn until then."""
-        while self._reloads and now - self._reloads[0] > self._options.reload_seconds:
-            self._reloads.popleft()
         self._errors.add("model", f"{error}; reading it anew")
-        if len(self._reloads) >= self._options.reloads:
-            self._errors.add(
-                "host", f"the model changed {len(self._reloads) + 1} times in a row: the host is inconsistent"
-            )
-            self._stop()
+        if not self._recovery.may_reload(now):
+            self._errors.add("host", f"{self._store.name}: the model changes again and again; the host is inconsistent")
+            self._stop(now)
             return
-        self._reloads.append(now)
         for task in self._tasks - {asyncio.current_task()}:
             task.cancel()
         self._scheduler = Scheduler(self._options.scheduler)
@@ -458,6 +404,6 @@ class AccessLayer:
         self._store.forget()
         self._issue()
 
-    def _stop(self) -> None:
+    def _stop(self, now: float) -> None:
         self._stopped = True
-        self._wanted_time.set(self._clock(), wanting=False)
+        self._wanted.stop(now)

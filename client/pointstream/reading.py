@@ -17,7 +17,7 @@ import numpy as np
 from lpc.errors import Corrupt, ModelChanged
 from lpc.ranges import coalesce
 
-from .build import decode_checked
+from .decoding import decode_checked
 from .opening import add_page, open_index
 
 if TYPE_CHECKING:

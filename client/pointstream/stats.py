@@ -71,24 +71,6 @@ class LayerStats:
     errors: tuple[ErrorReport, ...]
 
 
-class WantedTime:
-    """Seconds during which something was wanted."""
-
-    def __init__(self, now: float) -> None:
-        self._total = 0.0
-        self._since: float | None = now
-
-    def set(self, now: float, wanting: bool) -> None:
-        """Say whether anything is wanted from now on."""
-        if self._since is not None:
-            self._total += now - self._since
-        self._since = now if wanting else None
-
-    def seconds(self, now: float) -> float:
-        """Sum up to now."""
-        return self._total + (0.0 if self._since is None else now - self._since)
-
-
 class ErrorLog:
     """Errors, reported once per cause."""
 
