@@ -47,6 +47,11 @@ class Channels:
     def __len__(self) -> int:
         return len(self.bits)
 
+    @property
+    def normal_rows(self) -> NDArray[np.int64]:
+        """Rows of the normals, (2 m,)."""
+        return (self.normals[:, :1] + (0, 1)).ravel()
+
 
 def _shape(attribute: Attribute) -> tuple[list[int], int, list[int]]:
     """Bits of the channels of one attribute, their start value, and how many channels each block takes."""

@@ -159,16 +159,16 @@ def encode_clouds(
     window = WINDOWS[effort]
     compressor = _contexts.compressor(effort)
     return [
-        _frame(encode(lattice, rows, begin, end, channels, window), window, channels, compressor)
+        _frame(encode(lattice, rows, begin, end, channels, window), channels, compressor)
         for begin, end in itertools.pairwise(edges)
     ]
 
 
-def _frame(packed: Packed, window: int, channels: Channels, compressor: zstandard.ZstdCompressor) -> bytes:
+def _frame(packed: Packed, channels: Channels, compressor: zstandard.ZstdCompressor) -> bytes:
     """Compress a payload with a block for each kind of number, so that each has Huffman codes of its own."""
     if packed.nbits > 16 or packed.shift > 32:
         raise ValueError(f"a cloud spans 2**{packed.nbits + packed.shift} steps, 2**48 are the most")
-    head = pack_header(packed, window) + packed.raw.tobytes()
+    head = pack_header(packed) + packed.raw.tobytes()
     stream = compressor.compressobj(size=len(head) + packed.tokens.size)
     out = [stream.compress(head)]
     for first, stop in ((-1, 0), *channels.groups):

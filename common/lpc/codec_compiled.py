@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba import njit
 
-from .payload import Layout, Packed, Unpacked
+from .normals_compiled import best_planes, best_turn, from_planes
+from .normals_compiled import turn_back as turn_back
+from .payload import Layout, Packed, Unpacked, plane_window
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,10 +36,33 @@ def encode(
     lattice: NDArray[np.int64], rows: NDArray[np.uint32], begin: int, end: int, channels: Channels, window: int
 ) -> Packed:
     """Pack the samples begin to end; see `codec.encode_cloud`."""
-    rotation, turn, nbits, shift, x, y, z, raw, tokens = _encode(
-        lattice, rows, begin, end, channels.bits, channels.start, channels.normals, window
-    )
-    return Packed(rotation, turn, nbits, shift, (x, y, z), raw, tokens)
+    rotation, nbits, shift, corner, code, order = _arrange(lattice, rows, begin, end)
+    k = end - begin
+    position = np.empty((k, 3), np.uint16)
+    before = np.empty(k, np.int64)
+    sorted_rows = np.empty((len(channels), k), np.uint32)
+    _gather_samples(lattice, rows, corner, shift, order, position, sorted_rows)
+    turn = grid = 0
+    residuals = np.empty((0, k), np.uint32)
+    if len(channels):
+        _predecessors(position, window, before)
+    if len(channels.normals):
+        turn, least, turned = best_turn(sorted_rows, before, channels)
+        near, back = plane_window(window, channels), before
+        if near != window:
+            back = np.empty(k, np.int64)
+            _predecessors(position, near, back)
+        grid, plane_turn, cost, residuals = best_planes(position, sorted_rows, back, channels, turn)
+        if grid and 64 * cost < 63 * least:  # planes take time
+            window, turn = near, plane_turn
+        else:
+            grid, residuals, sorted_rows = 0, residuals[:0], turned
+    raw, tokens = _pack(
+        lattice, corner, shift, 3 * nbits, order, code, sorted_rows, before, channels.bits, channels.start,
+        channels.normals, residuals,
+    )  # fmt: skip
+    x, y, z = corner.tolist()
+    return Packed(rotation, turn, grid, window, nbits, shift, (x, y, z), raw, tokens)
 
 
 def decode(payload: bytes, layout: Layout, channels: Channels) -> Unpacked:
@@ -47,17 +72,16 @@ def decode(payload: bytes, layout: Layout, channels: Channels) -> Unpacked:
     position = np.empty((k, 3), np.uint16)
     low = np.empty((k if layout.shift else 0, 3), np.uint32)
     rows = np.empty((len(channels), k), np.uint32)
+    before = np.empty(k, np.int64)
+    added = np.ones(len(channels), np.bool_)
+    added[channels.normal_rows] = not layout.grid
     largest = _decode(
         data, layout.starts, layout.tokens, layout.rotation, layout.shift, layout.window,
-        channels.bits, channels.start, position, low, rows,
+        channels.bits, channels.start, added, position, low, before, rows,
     )  # fmt: skip
+    if layout.grid:
+        from_planes(position, before, rows, channels, layout.grid, layout.turn)
     return Unpacked(int(largest), position, low if layout.shift else None, rows)
-
-
-def turn_back(rows: NDArray[np.uint32], channels: Channels, turn: int) -> None:
-    """Undo the turn of the normals, in place."""
-    for first, centre in channels.normals.tolist():
-        _turn_back(rows[first], rows[first + 1], centre, turn)
 
 
 @njit(cache=True, nogil=True)
@@ -201,12 +225,21 @@ def _nearest(xs: Any, ys: Any, zs: Any, i: int, window: int) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _predecessors(xs: Any, ys: Any, zs: Any, window: int, before: Any) -> None:
+def _predecessors(position: Any, window: int, before: Any) -> None:
     """Fill in `_nearest` of all samples; 0: there is none."""
     k = len(before)
+    xs, ys, zs = np.empty(PAD + k, np.float32), np.empty(PAD + k, np.float32), np.empty(PAD + k, np.float32)
+    xs[:PAD] = FAR
+    ys[:PAD] = 0
+    zs[:PAD] = 0
+    for i in range(k):
+        xs[PAD + i], ys[PAD + i], zs[PAD + i] = position[i, 0], position[i, 1], position[i, 2]
     if window == 64:  # a constant trip count is faster
         for i in range(k):
             before[i] = _nearest(xs, ys, zs, i, 64)
+    elif window == 32:
+        for i in range(k):
+            before[i] = _nearest(xs, ys, zs, i, 32)
     elif window == 16:
         for i in range(k):
             before[i] = _nearest(xs, ys, zs, i, 16)
@@ -229,84 +262,8 @@ def _residuals(value: Any, before: Any, bits: int, start: int, number: Any) -> N
 
 
 @njit(cache=True, nogil=True)
-def _unfold(first: Any, second: Any, centre: int) -> Any:
-    """Integer point of the octahedron |x| + |y| + |z| = centre of two codes."""
-    x, y = np.int64(first) - centre, np.int64(second) - centre
-    z = centre - abs(x) - abs(y)
-    if z < 0:
-        x, y = (centre - abs(y)) * (1 if x >= 0 else -1), (centre - abs(x)) * (1 if y >= 0 else -1)
-    return x, y, z
-
-
-@njit(cache=True, nogil=True)
-def _fold(x: int, y: int, z: int, centre: int) -> Any:
-    """Canonical codes of an integer point of the octahedron."""
-    if z < 0:
-        x, y = (centre - abs(y)) * (1 if x >= 0 else -1), (centre - abs(x)) * (1 if y >= 0 else -1)
-    return np.uint32(x + centre), np.uint32(y + centre)
-
-
-@njit(cache=True, nogil=True)
-def _turn(first: Any, second: Any, centre: int, turn: int, into_first: Any, into_second: Any) -> None:
-    """Turn the octahedron so that another of its six corners is the centre of the map; (0, 0) stays."""
-    axis, sign = turn >> 1, -1 if turn & 1 else 1
-    for i in range(len(first)):
-        if first[i] == 0 and second[i] == 0:
-            into_first[i] = into_second[i] = 0
-            continue
-        x, y, z = _unfold(first[i], second[i], centre)
-        if axis == 1:
-            x, y, z = y, z, x
-        elif axis == 2:
-            x, y, z = z, x, y
-        into_first[i], into_second[i] = _fold(x, y, sign * z, centre)
-
-
-@njit(cache=True, nogil=True)
-def _turn_back(first: Any, second: Any, centre: int, turn: int) -> None:
-    """Undo `_turn`, in place."""
-    axis, sign = turn >> 1, -1 if turn & 1 else 1
-    for i in range(len(first)):
-        if first[i] == 0 and second[i] == 0:
-            continue
-        x, y, z = _unfold(first[i], second[i], centre)
-        z *= sign
-        if axis == 1:
-            x, y, z = z, x, y
-        elif axis == 2:
-            x, y, z = y, z, x
-        first[i], second[i] = _fold(x, y, z, centre)
-
-
-@njit(cache=True, nogil=True)
-def _best_turn(rows: Any, before: Any, bits: Any, start: Any, normals: Any) -> int:
-    """Turn the normals in `rows` so that their residuals are shortest; returns the turn."""
-    if len(normals) == 0:
-        return 0
-    k = rows.shape[1]
-    turned = np.empty((2, k), np.uint32)
-    number = np.empty(k, np.uint64)
-    best, least = 0, np.int64(0)
-    for turn in range(6):
-        cost = np.int64(0)
-        for m in range(len(normals)):
-            row = normals[m, 0]
-            _turn(rows[row], rows[row + 1], normals[m, 1], turn, turned[0], turned[1])
-            for half in range(2):
-                _residuals(turned[half], before, bits[row], start[row], number)
-                for i in range(k):
-                    cost += _bit_length(number[i])
-        if turn == 0 or cost < least:
-            best, least = turn, cost
-    for m in range(len(normals)):
-        row = normals[m, 0]
-        _turn(rows[row], rows[row + 1], normals[m, 1], best, turned[0], turned[1])
-        rows[row], rows[row + 1] = turned[0], turned[1]
-    return best
-
-
-@njit(cache=True, nogil=True)
-def _encode(lattice: Any, rows: Any, begin: int, end: int, bits: Any, start: Any, normals: Any, window: int) -> Any:
+def _arrange(lattice: Any, rows: Any, begin: int, end: int) -> Any:
+    """Sort samples; returns rotation, bits and low bits of a coordinate, corner, sorted codes and sample numbers."""
     k = end - begin
     corner = lattice[begin].copy()
     far = lattice[begin].copy()
@@ -359,53 +316,61 @@ def _encode(lattice: Any, rows: Any, begin: int, end: int, bits: Any, start: Any
             if i - first > 1:
                 _sort_ties(lattice, rows, order, first, i)
             first = i
+    return rotation, nbits, shift, corner, code, order
 
-    raw_bits = 3 * shift + max(3 * nbits - 2, 0)
+
+@njit(cache=True, nogil=True)
+def _gather_samples(
+    lattice: Any, rows: Any, corner: Any, shift: int, order: Any, position: Any, sorted_rows: Any
+) -> None:  # fmt: skip
+    """Local coordinates without low bits and channels, both in order."""
+    for i in range(len(order)):
+        for axis in range(3):
+            position[i, axis] = (lattice[order[i], axis] - corner[axis]) >> shift
+    for row in range(len(sorted_rows)):
+        for i in range(len(order)):
+            sorted_rows[row, i] = rows[row, order[i]]
+
+
+@njit(cache=True, nogil=True)
+def _pack(
+    lattice: Any, corner: Any, shift: int, code_bits: int, order: Any, code: Any, rows: Any, before: Any, bits: Any,
+    start: Any, normals: Any, residuals: Any,
+) -> Any:  # fmt: skip
+    """Write all streams; `residuals` are those of the normals if planes predict them."""
+    k = len(order)
+    raw_bits = 3 * shift + max(code_bits - 2, 0)
     for row in range(len(bits)):
         raw_bits += max(bits[row] - 2, 0)
     raw = np.empty((k * raw_bits + 7) // 8 + 2 + len(bits), np.uint8)
     tokens = np.empty((1 + len(bits), k), np.uint8)
     at = 0
-    xs, ys, zs = np.empty(PAD + k, np.float32), np.empty(PAD + k, np.float32), np.empty(PAD + k, np.float32)
-    xs[:PAD] = FAR
-    ys[:PAD] = 0
-    zs[:PAD] = 0
-    pending = np.uint64(0)
-    filled = 0
-    low_mask = (np.int64(1) << shift) - 1
-    for i in range(k):
-        sample = order[i]
-        x, y, z = (
-            lattice[sample, 0] - corner[0],
-            lattice[sample, 1] - corner[1],
-            lattice[sample, 2] - corner[2],
-        )
-        xs[PAD + i], ys[PAD + i], zs[PAD + i] = x >> shift, y >> shift, z >> shift
-        if shift:
-            at, pending, filled = _put(raw, at, pending, filled, np.uint64(x & low_mask), shift)
-            at, pending, filled = _put(raw, at, pending, filled, np.uint64(y & low_mask), shift)
-            at, pending, filled = _put(raw, at, pending, filled, np.uint64(z & low_mask), shift)
-    at = _finish(raw, at, pending, filled)
+    if shift:
+        pending = np.uint64(0)
+        filled = 0
+        mask = (np.int64(1) << shift) - 1
+        for i in range(k):
+            for axis in range(3):
+                low = np.uint64((lattice[order[i], axis] - corner[axis]) & mask)
+                at, pending, filled = _put(raw, at, pending, filled, low, shift)
+        at = _finish(raw, at, pending, filled)
 
-    number = code_spare
+    number = np.empty(k, np.uint64)
     number[0] = code[0]
     for i in range(1, k):
         number[i] = code[i] - code[i - 1]
     at = _write(number, tokens[0], raw, at)
-
-    turn = 0
-    if len(bits):
-        before = np.empty(k, np.int64)
-        _predecessors(xs, ys, zs, window, before)
-        sorted_rows = np.empty((len(bits), k), np.uint32)
-        for row in range(len(bits)):
+    place = np.full(len(bits), -1, np.int64)
+    for m in range(len(residuals) // 2):
+        place[normals[m, 0]], place[normals[m, 0] + 1] = 2 * m, 2 * m + 1
+    for row in range(len(bits)):
+        if place[row] >= 0:
             for i in range(k):
-                sorted_rows[row, i] = rows[row, order[i]]
-        turn = _best_turn(sorted_rows, before, bits, start, normals)
-        for row in range(len(bits)):
-            _residuals(sorted_rows[row], before, bits[row], start[row], number)
-            at = _write(number, tokens[1 + row], raw, at)
-    return rotation, turn, nbits, shift, corner[0], corner[1], corner[2], raw[:at], tokens
+                number[i] = residuals[place[row], i]
+        else:
+            _residuals(rows[row], before, bits[row], start[row], number)
+        at = _write(number, tokens[1 + row], raw, at)
+    return raw[:at], tokens
 
 
 @njit(cache=True, nogil=True)
@@ -431,8 +396,9 @@ def _number(data: Any, bit: Any, token: Any) -> Any:
 @njit(cache=True, nogil=True)
 def _decode(
     data: Any, starts: Any, tokens: int, rotation: int, shift: int, window: int,
-    bits: Any, start: Any, position: Any, low: Any, rows: Any,
+    bits: Any, start: Any, added: Any, position: Any, low: Any, before: Any, rows: Any,
 ) -> Any:  # fmt: skip
+    """Fill in the arrays; rows that are not `added` up get their residuals, signed. Returns the largest code."""
     k = len(position)
     if shift:
         bit = np.uint64(starts[0] * 8)
@@ -442,10 +408,6 @@ def _decode(
                 low[i, axis] = _word(data, bit) & mask
                 bit += np.uint64(shift)
 
-    xs, ys, zs = np.empty(PAD + k, np.float32), np.empty(PAD + k, np.float32), np.empty(PAD + k, np.float32)
-    xs[:PAD] = FAR
-    ys[:PAD] = 0
-    zs[:PAD] = 0
     a, b, c = rotation, (rotation + 1) % 3, (rotation + 2) % 3
     code = np.uint64(0)
     largest = np.uint64(0)
@@ -456,11 +418,9 @@ def _decode(
         largest = max(largest, code)
         x, y, z = _gather(code), _gather(code >> np.uint64(1)), _gather(code >> np.uint64(2))
         position[i, a], position[i, b], position[i, c] = x, y, z
-        xs[PAD + i], ys[PAD + i], zs[PAD + i] = x, y, z  # L1 does not mind which axis is which
 
     if len(bits):
-        before = np.empty(k, np.int64)
-        _predecessors(xs, ys, zs, window, before)
+        _predecessors(position, window, before)
         for row in range(len(bits)):
             tokens += k
             bit = np.uint64(starts[2 + row] * 8)
@@ -469,7 +429,10 @@ def _decode(
             for i in range(k):
                 zigzag, bit = _number(data, bit, data[tokens + i])
                 residual = np.uint32((zigzag >> np.uint64(1)) ^ (np.uint64(0) - (zigzag & np.uint64(1))))
-                back = before[i]
-                guess = value[i - back] if back else np.uint32(start[row])
-                value[i] = np.uint32(np.uint32(guess + residual) & levels)
+                if added[row]:
+                    back = before[i]
+                    guess = value[i - back] if back else np.uint32(start[row])
+                    value[i] = np.uint32(np.uint32(guess + residual) & levels)
+                else:
+                    value[i] = residual
     return largest

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .octahedral import fold_codes, unfold_codes
-from .payload import RAW_BITS, TOP_BITS, TURNS, Layout, Packed, Unpacked
+from .normals_numpy import best_planes, best_turn, from_planes
+from .normals_numpy import turn_back as turn_back
+from .payload import RAW_BITS, TOP_BITS, Layout, Packed, Unpacked, plane_window
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -44,12 +45,23 @@ def encode(
     streams = [_pack_bits(low_bits, np.full(low_bits.size, shift, np.int64))] if shift else []
     numbers = [np.diff(code, prepend=np.uint64(0))]
     before = _nearest(top, window)
-    turned = [_turn(rows, channels, turn) for turn in range(TURNS if len(channels.normals) else 1)]
-    normal_rows = (channels.normals[:, :1] + (0, 1)).ravel()
-    turn = min(range(len(turned)), key=lambda t: sum(
-        int(_bit_length(_zigzag(turned[t][row], before, channels, row)).sum()) for row in normal_rows.tolist()
-    ))  # fmt: skip
-    numbers += [_zigzag(turned[turn][row], before, channels, row) for row in range(len(channels))]
+    turn = grid = 0
+    residuals = np.empty((0, len(code)), np.uint32)
+    if len(channels.normals):
+        turn, least, turned = best_turn(rows, before, channels)
+        near = plane_window(window, channels)
+        grid, plane_turn, cost, residuals = best_planes(
+            top.astype(np.uint16), rows, _nearest(top, near), channels, turn
+        )
+        if grid and 64 * cost < 63 * least:  # planes take time
+            window, turn = near, plane_turn
+        else:
+            grid, rows = 0, turned
+    channel_numbers = [_zigzag(rows[row], before, channels, row) for row in range(len(channels))]
+    if grid:
+        for row, residual in zip(channels.normal_rows.tolist(), residuals, strict=True):
+            channel_numbers[row] = residual.astype(np.uint64)
+    numbers += channel_numbers
     tokens = np.empty((len(numbers), len(code)), np.uint8)
     for stream, number in enumerate(numbers):
         length = _bit_length(number)
@@ -58,7 +70,7 @@ def encode(
         tokens[stream] = np.where(length < 2, number.astype(np.int64), ((length - 1) << 1) | next_bit)
         streams.append(_pack_bits(number & ((np.uint64(1) << raw.astype(np.uint64)) - np.uint64(1)), raw))
     x, y, z = corner.tolist()
-    return Packed(rotation, turn, nbits, shift, (x, y, z), np.concatenate(streams), tokens)
+    return Packed(rotation, turn, grid, window, nbits, shift, (x, y, z), np.concatenate(streams), tokens)
 
 
 def decode(payload: bytes, layout: Layout, channels: Channels) -> Unpacked:
@@ -83,38 +95,20 @@ def decode(payload: bytes, layout: Layout, channels: Channels) -> Unpacked:
             number = _numbers(data, starts[2 + row], tokens[1 + row]).astype(np.uint32)
             residuals[row, 1:] = (number >> np.uint32(1)) ^ (np.uint32(0) - (number & np.uint32(1)))
         before = _nearest(position, layout.window)
+        stored = residuals[channels.normal_rows, 1:]
+        added = set(range(len(channels))) - (set(channels.normal_rows.tolist()) if layout.grid else set())
         jump = np.zeros(k + 1, np.intp)
         jump[1:] = np.where(before == 0, 0, np.arange(1, k + 1) - before)
-        while jump.any():
-            for residual in residuals:
-                residual += residual.take(jump)
+        while added and jump.any():
+            for row in added:
+                residuals[row] += residuals[row].take(jump)
             jump = jump.take(jump)
         modulo = ((np.int64(1) << channels.bits) - 1).astype(np.uint32)
         rows = (residuals[:, 1:] + channels.start[:, None]) & modulo[:, None]
+        if layout.grid:
+            rows[channels.normal_rows] = stored
+            from_planes(position, before, rows, channels, layout.grid, layout.turn)
     return Unpacked(int(code.max()), position, low, rows)
-
-
-def turn_back(rows: NDArray[np.uint32], channels: Channels, turn: int) -> None:
-    """Undo the turn of the normals, in place."""
-    axis, sign = turn >> 1, -1 if turn & 1 else 1
-    for first, centre in channels.normals.tolist():
-        stored = unfold_codes(rows[first : first + 2], centre)
-        points = np.empty_like(stored)
-        points[axis], points[(axis + 1) % 3], points[(axis + 2) % 3] = stored[0], stored[1], sign * stored[2]
-        none = (rows[first : first + 2] == 0).all(axis=0)
-        rows[first : first + 2] = np.where(none, 0, fold_codes(points, centre))
-
-
-def _turn(rows: NDArray[np.uint32], channels: Channels, turn: int) -> NDArray[np.uint32]:
-    """Turn the octahedron so that another of its six corners is the centre of the map; (0, 0) stays."""
-    axis, sign = turn >> 1, -1 if turn & 1 else 1
-    turned = rows.copy()
-    for first, centre in channels.normals.tolist():
-        points = unfold_codes(rows[first : first + 2], centre)
-        stored = np.stack([points[axis], points[(axis + 1) % 3], sign * points[(axis + 2) % 3]])
-        none = (rows[first : first + 2] == 0).all(axis=0)
-        turned[first : first + 2] = np.where(none, 0, fold_codes(stored, centre))
-    return turned
 
 
 def _zigzag(row: NDArray[np.uint32], before: NDArray[np.int64], channels: Channels, at: int) -> NDArray[np.uint64]:

@@ -23,15 +23,29 @@ CODEC = 1
 HEADER = struct.Struct("<BBBBBBBB")
 MAX_SAMPLES = 1 << 20
 MAX_WINDOW = 64
+PLANE_WINDOW = 32
 MAX_CORNER_BYTES = 7
 TURNS = 6
 TOP_BITS = 16
+FIRST_GRID, LAST_GRID = 8, 79
+"""Cells of planes: 4 / 7 of a local unit to 2**17 of them."""
+MAX_GRID_SAMPLES = 1 << 16
 MAX_SHIFT = 32
 ORIGIN_LIMIT = 1 << 52
 """Lattice coordinates stay below this, so float64 holds them exactly."""
 
 RAW_BITS = np.array([0, 0] + [(token >> 1) - 1 for token in range(2, 256)], np.uint8)
 """Raw bits that follow a token."""
+
+
+def table_bits(samples: int) -> int:
+    """Bits an axis of the number of a node among those of so many samples (docs/format.md, Planes)."""
+    return ((16 * samples - 1).bit_length() + 2) // 3
+
+
+def plane_window(window: int, channels: Channels) -> int:
+    """Previous samples to look at where planes predict the normals: they need fewer, other channels do not."""
+    return min(window, PLANE_WINDOW) if len(channels) == 2 * len(channels.normals) else window
 
 
 class Packed(NamedTuple):
@@ -42,6 +56,8 @@ class Packed(NamedTuple):
 
     rotation: int
     turn: int
+    grid: int
+    window: int
     nbits: int
     shift: int
     origin: tuple[int, int, int]
@@ -68,7 +84,7 @@ class Layout:
 
     Parameters
     ----------
-    samples, rotation, turn, nbits, shift, origin, window
+    samples, rotation, turn, grid, nbits, shift, origin, window
         As in docs/format.md.
     starts : ndarray, (2 + c,) int64
         Byte offsets of the raw streams in the payload: low bits, position, channels.
@@ -79,6 +95,7 @@ class Layout:
     samples: int
     rotation: int
     turn: int
+    grid: int
     nbits: int
     shift: int
     origin: tuple[int, int, int]
@@ -87,10 +104,12 @@ class Layout:
     tokens: int
 
 
-def pack_header(packed: Packed, window: int) -> bytes:
+def pack_header(packed: Packed) -> bytes:
     """Return the bytes before the raw streams."""
     corner_bytes = max((corner ^ (corner >> 63)).bit_length() // 8 + 1 for corner in packed.origin)
-    head = HEADER.pack(CODEC, packed.rotation, packed.nbits, packed.shift, window, packed.turn, corner_bytes, 0)
+    head = HEADER.pack(
+        CODEC, packed.rotation, packed.nbits, packed.shift, packed.window, packed.turn, corner_bytes, packed.grid
+    )
     return head + b"".join(corner.to_bytes(corner_bytes, "little", signed=True) for corner in packed.origin)
 
 
@@ -129,11 +148,13 @@ def parse_layout(payload: bytes, *, samples: int, channels: Channels) -> Layout:
     streams = 1 + len(channels)
     if len(payload) < HEADER.size + streams * samples:
         raise Corrupt(f"cloud: {len(payload)} bytes cannot hold {samples} samples")
-    codec, rotation, nbits, shift, window, turn, corner_bytes, reserved = HEADER.unpack_from(payload)
+    codec, rotation, nbits, shift, window, turn, corner_bytes, grid = HEADER.unpack_from(payload)
     if codec != CODEC:
         raise Corrupt(f"cloud: codec {codec} is unknown")
-    if rotation > 2 or turn >= TURNS or window > MAX_WINDOW or corner_bytes > MAX_CORNER_BYTES or reserved:
+    if rotation > 2 or turn >= TURNS or window > MAX_WINDOW or corner_bytes > MAX_CORNER_BYTES:
         raise Corrupt(f"cloud: its header {payload[: HEADER.size].hex()} is out of range")
+    if grid and (not FIRST_GRID <= grid <= LAST_GRID or samples > MAX_GRID_SAMPLES):
+        raise Corrupt(f"cloud: grid {grid} of {samples} samples is out of range")
     if nbits > TOP_BITS or shift > MAX_SHIFT or (shift and nbits < TOP_BITS):
         raise Corrupt(f"cloud: {nbits} + {shift} bits a coordinate are not allowed")
     head = HEADER.size + 3 * corner_bytes
@@ -157,6 +178,6 @@ def parse_layout(payload: bytes, *, samples: int, channels: Channels) -> Layout:
         raise Corrupt(f"cloud: {len(payload)} bytes, its tokens ask for {ends[-1] + streams * samples}")
     starts = np.concatenate(([head], ends[:-1]))
     return Layout(
-        samples=samples, rotation=rotation, turn=turn, nbits=nbits, shift=shift, origin=(x, y, z), window=window,
-        starts=starts, tokens=int(ends[-1]),
+        samples=samples, rotation=rotation, turn=turn, grid=grid, nbits=nbits, shift=shift, origin=(x, y, z),
+        window=window, starts=starts, tokens=int(ends[-1]),
     )  # fmt: skip

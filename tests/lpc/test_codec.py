@@ -91,7 +91,7 @@ def test_any_window_decodes(cloud: RawCloud, window: int) -> None:
         )
         for engine in (codec_compiled, codec_numpy)
     ]
-    payloads = [pack_header(p, window) + p.raw.tobytes() + p.tokens.tobytes() for p in packed]
+    payloads = [pack_header(p) + p.raw.tobytes() + p.tokens.tobytes() for p in packed]
     assert payloads[0] == payloads[1]
     layout = parse_layout(payloads[0], samples=len(cloud), channels=channels)
     first, second = (engine.decode(payloads[0], layout, channels) for engine in (codec_compiled, codec_numpy))
