@@ -153,10 +153,10 @@ def _turn_back(first: Any, second: Any, centre: int, turn: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _added_cost(first: Any, second: Any, before: Any, bits: int, centre: int, every: int) -> Any:
-    """Bits of the residuals of samples 0, every, 2 every, ... where predecessors predict normals."""
+def _added_cost(first: Any, second: Any, before: Any, bits: int, centre: int) -> Any:
+    """Bits of the residuals where predecessors predict normals."""
     cost = np.int64(0)
-    for i in range(0, len(before), every):
+    for i in range(len(before)):
         back = before[i]
         u, v = (np.int64(first[i - back]), np.int64(second[i - back])) if back else (centre, centre)
         cost += _size(np.int64(first[i]) - u, bits)
@@ -172,15 +172,13 @@ def _best_turn(rows: Any, before: Any, bits: Any, normals: Any, turned: Any) -> 
         for m in range(len(normals)):
             row, centre = normals[m]
             _turn(rows[row], rows[row + 1], centre, turn, turned[row], turned[row + 1])
-            cost += _added_cost(turned[row], turned[row + 1], before, bits[row], centre, EVERY)
+            cost += _added_cost(turned[row], turned[row + 1], before, bits[row], centre)
         if turn == 0 or cost < least:
             best, least = turn, cost
-    cost = np.int64(0)
     for m in range(len(normals)):
         row, centre = normals[m]
         _turn(rows[row], rows[row + 1], centre, best, turned[row], turned[row + 1])
-        cost += _added_cost(turned[row], turned[row + 1], before, bits[row], centre, 1)
-    return best, cost
+    return best, least
 
 
 @njit(cache=True, nogil=True)
@@ -302,32 +300,35 @@ def _guess(normal: Any, i: int, back: int, first: Any, second: Any, centre: int,
 
 
 @njit(cache=True, nogil=True)
-def _carried(residual: Any, before: Any, i: int, bits: int) -> Any:
-    """Guess the residual of sample i by two up the tree of predecessors; large ones tell nothing."""
-    u = v = 4
-    for factor in (3, 1):
-        back = before[i]
-        if not back:
-            break
-        i -= back
-        first, second = residual[i, 0], residual[i, 1]
-        if 5 * max(abs(first), abs(second)) < np.int64(1) << bits:
-            u += factor * first
-            v += factor * second
-    return u >> 3, v >> 3
+def _note(small: Any, above: Any, i: int, back: int, first: Any, second: Any, bits: int) -> None:
+    """Remember the residuals of sample i in place i + 1, if they are small, and the place of its predecessor."""
+    if 5 * max(abs(first), abs(second)) < np.int64(1) << bits:
+        small[i + 1, 0], small[i + 1, 1] = first, second
+    above[i + 1] = i + 1 - back if back else 0
+
+
+@njit(cache=True, nogil=True)
+def _carried(small: Any, above: Any, i: int, back: int) -> Any:
+    """Guess the residuals of sample i by two up the tree of predecessors; place 0 is nothing."""
+    j = i + 1 - back if back else 0
+    jj = above[j]
+    return (3 * small[j, 0] + small[jj, 0] + 4) >> 3, (3 * small[j, 1] + small[jj, 1] + 4) >> 3
 
 
 @njit(cache=True, nogil=True)
 def _add_planes(normal: Any, before: Any, first: Any, second: Any, bits: int, centre: int, turn: int) -> None:
     k = len(before)
-    residual = np.empty((k, 2), np.int64)
+    small = np.zeros((k + 1, 2), np.int64)
+    above = np.zeros(k + 1, np.int64)
     levels = (np.int64(1) << bits) - 1
     for i in range(k):
-        residual[i, 0], residual[i, 1] = np.int32(first[i]), np.int32(second[i])
-        u, v = _guess(normal, i, before[i], first, second, centre, turn)
-        more = _carried(residual, before, i, bits)
-        first[i] = np.uint32((u + more[0] + residual[i, 0]) & levels)
-        second[i] = np.uint32((v + more[1] + residual[i, 1]) & levels)
+        back = before[i]
+        a, b = np.int64(np.int32(first[i])), np.int64(np.int32(second[i]))
+        u, v = _guess(normal, i, back, first, second, centre, turn)
+        more = _carried(small, above, i, back)
+        _note(small, above, i, back, a, b, bits)
+        first[i] = np.uint32((u + more[0] + a) & levels)
+        second[i] = np.uint32((v + more[1] + b) & levels)
 
 
 @njit(cache=True, nogil=True)
@@ -410,18 +411,20 @@ def _best_planes(
     _planes(position, best, table, 1, normal)
     best_turn = _best_turn_of_planes(normal, rows, before, bits, normals, turned)
     cost = np.int64(0)
-    residual = np.empty((k, 2), np.int64)
     for m in range(len(normals)):
         row, centre = normals[m]
         first, second = turned[row], turned[row + 1]
         _turn(rows[row], rows[row + 1], centre, best_turn, first, second)
+        small = np.zeros((k + 1, 2), np.int64)
+        above = np.zeros(k + 1, np.int64)
         for i in range(k):
-            u, v = _guess(normal, i, before[i], first, second, centre, best_turn)
-            more = _carried(residual, before, i, bits[row])
-            for half in range(2):
-                value, guess = (second[i], v + more[1]) if half else (first[i], u + more[0])
-                zigzag = _zigzag(np.int64(value) - guess, bits[row])
-                residual[i, half] = -((zigzag + 1) >> 1) if zigzag & 1 else zigzag >> 1
-                number[2 * m + half, i] = zigzag
-                cost += _size(residual[i, half], bits[row])
+            back = before[i]
+            u, v = _guess(normal, i, back, first, second, centre, best_turn)
+            more = _carried(small, above, i, back)
+            a = _zigzag(np.int64(first[i]) - u - more[0], bits[row])
+            b = _zigzag(np.int64(second[i]) - v - more[1], bits[row])
+            number[2 * m, i], number[2 * m + 1, i] = a, b
+            a, b = (a >> 1) ^ -(a & 1), (b >> 1) ^ -(b & 1)
+            _note(small, above, i, back, a, b, bits[row])
+            cost += _size(a, bits[row]) + _size(b, bits[row])
     return best, best_turn, cost

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 KEPT = 20
 """Bits that matrices and vectors are cut to: products of two, and sums of three of them, stay below 2**53."""
 EVERY = 4
-"""One sample in so many tells how well a turn or a grid suits."""
+"""One sample in so many tells how well a grid suits."""
 
 _PRODUCTS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 _COMPOSED = np.array(
@@ -51,16 +51,16 @@ def best_turn(
     """Return the turn that makes residuals of normals shortest, their cost, and the turned rows."""
     turned = [_turn(rows, channels, turn) for turn in range(TURNS)]
 
-    def cost(rows: NDArray[np.uint32], every: int) -> int:
+    def cost(rows: NDArray[np.uint32]) -> int:
         total = 0
         for row in channels.normal_rows.tolist():
             value = rows[row].astype(np.int64)
             guess = np.where(before == 0, int(channels.start[row]), value[np.arange(len(value)) - before])
-            total += int(_size(_smallest(value - guess, int(channels.bits[row])))[::every].sum())
+            total += int(_size(_smallest(value - guess, int(channels.bits[row]))).sum())
         return total
 
-    best = min(range(TURNS), key=lambda turn: cost(turned[turn], EVERY))
-    return best, cost(turned[best], 1), turned[best]
+    best = min(range(TURNS), key=lambda turn: cost(turned[turn]))
+    return best, cost(turned[best]), turned[best]
 
 
 def best_planes(
