@@ -86,23 +86,28 @@ def export(model: str, out: Path, level: int | None, spacing: float | None, boun
     """Write the samples of MODEL to OUT.{ply,las,laz,xyz,npz}, every one once."""
     if level is not None and spacing is not None:
         raise click.UsageError("give --level or --spacing, not both")
-    from .writers import write_points
+    from .writers import SUFFIXES, Target, write_points
 
+    if out.suffix.lower() not in SUFFIXES:
+        raise click.UsageError(f"{out}: the suffix says the format; use one of {', '.join(SUFFIXES)}")
     with open_model(model) as opened:
         header = opened.header
         choice = {"level": level, "spacing": spacing, "bounds": bounds}
         total = opened.count(**choice)  # type: ignore[arg-type]
         # Counts stand at the head of most formats, so what the bounds cut is counted first.
         count = total if bounds is None else sum(map(len, _batches(opened, "counting", total, choice)))
-        write_points(
-            out,
-            _batches(opened, "exporting", count, choice),
+        target = Target(
             count=count,
-            crs=header.crs,
             attributes=opened.attributes,
+            bounds=opened.reach,
             position_error=header.position_error,
+            crs=header.crs,
         )
-    click.echo(f"{out}: {count} samples", err=True)
+        dropped = write_points(out, _batches(opened, "exporting", count, choice), target)
+        complete = opened.info["complete"]
+    click.echo(f"{out}: {count} samples" + ("" if complete else " of a file that is cut short"), err=True)
+    for name in dropped:
+        click.echo(f"{out}: left out {name}, the format has no room for it", err=True)
 
 
 def _batches(model: Model, label: str, total: int, choice: dict[str, Any]) -> Iterator[PointBatch]:

@@ -105,6 +105,13 @@ class Model:
         stored = {item.name: np.dtype(item.dtype) for item in self.header.attributes}
         return stored | {name: constant.fill(0).dtype for name, constant in self.header.constants.items()}
 
+    @property
+    def reach(self) -> tuple[float, float, float, float, float, float]:
+        """Box x0, y0, z0, x1, y1, z1 that no decoded sample leaves: the bounds and the position error around them."""
+        x0, y0, z0, x1, y1, z1 = self.header.bounds
+        error = self.header.position_error
+        return x0 - error, y0 - error, z0 - error, x1 + error, y1 + error, z1 + error
+
     def read(
         self, *, bounds: Sequence[float] | None = None, spacing: float | None = None, level: int | None = None
     ) -> PointBatch:
