@@ -135,6 +135,11 @@ class AccessLayer:
         return self._now.absent
 
     @property
+    def wanting(self) -> bool:
+        """Whether anything that the last frame wanted is not here and can still come."""
+        return self._wanted.anything
+
+    @property
     def stats(self) -> LayerStats:
         """What was counted so far."""
         now, meter, residency = self._clock(), self._store.meter, self._now.residency
