@@ -66,9 +66,10 @@ def _facts(entry: Entry) -> list[tuple[str, str]]:
     low, high = header.bounds[:3], header.bounds[3:]
     size = " × ".join(f"{b - a:.6g}" for a, b in zip(low, high, strict=True))
     attributes = [attribute.name for attribute in header.attributes] + sorted(header.constants)
+    bits = header.bits_per_sample.get("total", 8 * header.bytes / header.samples)
     facts = [
         ("samples", f"{count(header.samples)} in {count(header.nodes)} clouds, {header.levels} levels"),
-        ("size", f"{byte_size(entry.size)}, {8 * header.bytes / header.samples:.1f} bits a sample"),
+        ("size", f"{byte_size(entry.size)}, {bits:.1f} bits a sample"),
         ("attributes", ", ".join(attributes) or "none"),
         ("extent", f"{size}, spacing {header.spacing:.3g}, error at most {header.position_error:.2g}"),
         ("bounds", f"{_point(low)} to {_point(high)}"),
