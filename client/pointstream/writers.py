@@ -30,37 +30,11 @@ _COPY = 1 << 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Target:
-    """The arguments of `write_points`."""
-
-    path: Path
-    count: int
-    attributes: Mapping[str, np.dtype[Any]]
-    bounds: tuple[float, ...]
-    position_error: float
-    crs: str | None
-
-
-def write_points(
-    path: str | Path,
-    batches: Iterator[PointBatch],
-    *,
-    count: int,
-    attributes: Mapping[str, np.dtype[Any]],
-    bounds: Sequence[float],
-    position_error: float = 0.0,
-    crs: str | None = None,
-) -> list[str]:
-    """Write samples to a file whose suffix says the format.
+class Target:
+    """What is to be written.
 
     Parameters
     ----------
-    path : str or Path
-        ``.ply``: binary little-endian, ``x y z`` double, ``nx ny nz`` float, ``red green blue`` uchar or ushort, others
-        as they are; ``.las`` and ``.laz``: version 1.4, what LAS has no field for as extra dimensions; ``.xyz``: text
-        ``x y z [intensity] [red green blue] [nx ny nz]``; ``.npz``: arrays ``xyz`` and each attribute by name.
-    batches : iterator of PointBatch
-        Written one after another, never held together.
     count : int
         Samples in all batches together.
     attributes : mapping of str to dtype
@@ -72,6 +46,28 @@ def write_points(
         their numbers reach that far, and without a stated error as little as they can.
     crs : str or None
         WKT, kept by LAS and LAZ.
+    """
+
+    count: int
+    attributes: Mapping[str, np.dtype[Any]]
+    bounds: Sequence[float]
+    position_error: float = 0.0
+    crs: str | None = None
+
+
+def write_points(path: str | Path, batches: Iterator[PointBatch], target: Target) -> list[str]:
+    """Write samples to a file whose suffix says the format.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``.ply``: binary little-endian, ``x y z`` double, ``nx ny nz`` float, ``red green blue`` uchar or ushort, others
+        as they are; ``.las`` and ``.laz``: version 1.4, what LAS has no field for as extra dimensions; ``.xyz``: text
+        ``x y z [intensity] [red green blue] [nx ny nz]``; ``.npz``: arrays ``xyz`` and each attribute by name.
+    batches : iterator of PointBatch
+        Written one after another, never held together.
+    target : Target
+        What the batches hold.
 
     Returns
     -------
@@ -88,12 +84,9 @@ def write_points(
     if write is None:
         kind = path.suffix or "files without a suffix"
         raise StoreError(f"{path}: cannot write {kind}; use one of {', '.join(SUFFIXES)}")
-    target = _Target(
-        path=path, count=count, attributes=attributes, bounds=tuple(bounds), position_error=position_error, crs=crs
-    )
     try:
         with _beside(path) as file:
-            return write(file, _counted(batches, target), target)
+            return write(file, _counted(path, batches, target), target)
     except LpcError:
         raise
     except ImportError as error:
@@ -117,22 +110,22 @@ def _beside(path: Path) -> Iterator[BinaryIO]:
         raise
 
 
-def _counted(batches: Iterator[PointBatch], target: _Target) -> Iterator[PointBatch]:
+def _counted(path: Path, batches: Iterator[PointBatch], target: Target) -> Iterator[PointBatch]:
     """Pass the batches on and check that they are what was announced: headers are written first."""
     found = 0
     for batch in batches:
         if batch.attributes.keys() != target.attributes.keys():
             came, announced = sorted(batch.attributes), sorted(target.attributes)
-            raise StoreError(f"{target.path}: a batch came with {came}, not {announced}; nothing was written")
+            raise StoreError(f"{path}: a batch came with {came}, not {announced}; nothing was written")
         found += len(batch)
         if found > target.count:
             break
         yield batch
     if found != target.count:
-        raise StoreError(f"{target.path}: {found:,} samples came, not {target.count:,}; nothing was written")
+        raise StoreError(f"{path}: {found:,} samples came, not {target.count:,}; nothing was written")
 
 
-def _write_ply(file: BinaryIO, batches: Iterator[PointBatch], target: _Target) -> list[str]:
+def _write_ply(file: BinaryIO, batches: Iterator[PointBatch], target: Target) -> list[str]:
     names = {"normal": ("nx", "ny", "nz"), "color": ("red", "green", "blue")}
     fields: list[tuple[str, str]] = [(axis, "<f8") for axis in "xyz"]
     for name, dtype in target.attributes.items():
@@ -160,7 +153,7 @@ def _write_ply(file: BinaryIO, batches: Iterator[PointBatch], target: _Target) -
     return []
 
 
-def _write_xyz(file: BinaryIO, batches: Iterator[PointBatch], target: _Target) -> list[str]:
+def _write_xyz(file: BinaryIO, batches: Iterator[PointBatch], target: Target) -> list[str]:
     # As many decimals as the positions are good for; without a stated error, all that a float64 has.
     decimals = max(0, int(np.ceil(-np.log10(target.position_error / 10)))) if target.position_error > 0 else None
     order = [name for name in ("intensity", "color", "normal") if name in target.attributes]
@@ -178,14 +171,14 @@ def _write_xyz(file: BinaryIO, batches: Iterator[PointBatch], target: _Target) -
     return [name for name in target.attributes if name not in order]
 
 
-def _write_npz(file: BinaryIO, batches: Iterator[PointBatch], target: _Target) -> list[str]:
+def _write_npz(file: BinaryIO, batches: Iterator[PointBatch], target: Target) -> list[str]:
     arrays: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {"xyz": (np.dtype(np.float64), (target.count, 3))}
     for name, dtype in target.attributes.items():
         arrays[name] = (dtype, (target.count, 3) if name in ("normal", "color") else (target.count,))
     # The members of an archive are written one after another, the batches hold all of them at once: each array
     # waits in a file of its own, so that memory holds one batch.
     with contextlib.ExitStack() as stack:
-        spools = {name: stack.enter_context(tempfile.TemporaryFile(dir=target.path.parent)) for name in arrays}
+        spools = {name: stack.enter_context(tempfile.TemporaryFile(dir=Path(file.name).parent)) for name in arrays}
         for batch in batches:
             for name, values in (("xyz", batch.xyz), *batch.attributes.items()):
                 rows: NDArray[Any] = np.ascontiguousarray(values, dtype=arrays[name][0])
@@ -201,15 +194,15 @@ def _write_npz(file: BinaryIO, batches: Iterator[PointBatch], target: _Target) -
     return []
 
 
-def _write_las(file: BinaryIO, batches: Iterator[PointBatch], target: _Target) -> list[str]:
+def _write_las(file: BinaryIO, batches: Iterator[PointBatch], target: Target) -> list[str]:
     return _las(file, batches, target, compress=False)
 
 
-def _write_laz(file: BinaryIO, batches: Iterator[PointBatch], target: _Target) -> list[str]:
+def _write_laz(file: BinaryIO, batches: Iterator[PointBatch], target: Target) -> list[str]:
     return _las(file, batches, target, compress=True)
 
 
-def _las(file: BinaryIO, batches: Iterator[PointBatch], target: _Target, *, compress: bool) -> list[str]:
+def _las(file: BinaryIO, batches: Iterator[PointBatch], target: Target, *, compress: bool) -> list[str]:
     import laspy  # takes longer to load than a small file to write
 
     header = laspy.LasHeader(version="1.4", point_format=_point_format(target.attributes))
@@ -226,7 +219,7 @@ def _las(file: BinaryIO, batches: Iterator[PointBatch], target: _Target, *, comp
             for axis, name in enumerate("XYZ"):
                 steps = np.rint((batch.xyz[:, axis] - header.offsets[axis]) / header.scales[axis])
                 if not (np.abs(steps) < 2**31).all():
-                    raise StoreError(f"{target.path}: a position outside {target.bounds}; nothing was written")
+                    raise StoreError(f"{file.name}: a position outside {tuple(target.bounds)}; nothing was written")
                 points[name] = steps
             for name, dimensions in plan.items():
                 values = batch.attributes[name]
@@ -252,7 +245,7 @@ def _las_scale(extent: float, position_error: float) -> float:
     return float(max(finest, wanted))
 
 
-def _las_dimensions(header: Any, target: _Target) -> tuple[dict[str, tuple[str, ...]], list[str]]:
+def _las_dimensions(header: Any, target: Target) -> tuple[dict[str, tuple[str, ...]], list[str]]:
     """Dimension of every attribute, extra ones added to the header; and attributes that fit nowhere."""
     import laspy
 
@@ -292,6 +285,6 @@ def _add_crs(header: Any, crs: str) -> list[str]:
     return []
 
 
-_WRITERS: dict[str, Callable[[BinaryIO, Iterator[PointBatch], _Target], list[str]]] = {
+_WRITERS: dict[str, Callable[[BinaryIO, Iterator[PointBatch], Target], list[str]]] = {
     ".ply": _write_ply, ".las": _write_las, ".laz": _write_laz, ".xyz": _write_xyz, ".npz": _write_npz,
 }  # fmt: skip

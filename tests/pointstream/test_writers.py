@@ -10,7 +10,7 @@ from plyfile import PlyData
 
 from lpc.errors import StoreError
 from lpc.points import PointBatch
-from pointstream.writers import SUFFIXES, write_points
+from pointstream.writers import SUFFIXES, Target, write_points
 
 SHAPES = {"normal": (3,), "color": (3,)}
 
@@ -31,7 +31,7 @@ def write(path, batch, size=300, **changes):
         "attributes": {name: values.dtype for name, values in batch.attributes.items()},
         "bounds": (*batch.xyz.min(0, initial=1e9), *batch.xyz.max(0, initial=-1e9)),
     }
-    return write_points(path, batches, **{**told, **changes})
+    return write_points(path, batches, Target(**{**told, **changes}))
 
 
 @pytest.mark.parametrize("color", ["u1", "u2"])
@@ -144,9 +144,7 @@ def test_an_interrupt_leaves_nothing(tmp_path):
         write_points(
             tmp_path / "a.laz",
             batches(),
-            count=20,
-            attributes=attributes,
-            bounds=(858000, 8505000, 3500, 858900, 8505400, 3530),
+            Target(count=20, attributes=attributes, bounds=(858000, 8505000, 3500, 858900, 8505400, 3530)),
         )
     assert not list(tmp_path.iterdir())
 
