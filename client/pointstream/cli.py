@@ -101,6 +101,8 @@ def export(model: str, out: Path, level: int | None, spacing: float | None, boun
             attributes=opened.attributes,
             bounds=opened.reach,
             position_error=header.position_error,
+            origin=header.origin,
+            step=header.step,
             crs=header.crs,
         )
         dropped = write_points(out, _batches(opened, "exporting", count, choice), target)

@@ -27,6 +27,7 @@ _PLY_TYPES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": 
               "f8": "double"}  # fmt: skip
 _WIDE = np.dtype("<f8")
 _COPY = 1 << 20
+_LAS_MOST = 2**31 - 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,8 +43,11 @@ class Target:
     bounds : sequence of 6 floats
         Box x0, y0, z0, x1, y1, z1 around the samples, model units: LAS lays its integers over it.
     position_error : float
-        Error that the positions have already, model units. Formats of fixed steps add at most a tenth of it where
-        their numbers reach that far, and without a stated error as little as they can.
+        Error that the positions have already, model units: text is as fine as a thousandth of it, and without a stated
+        error gives every digit.
+    origin, step : sequence of 3 floats, and float
+        Lattice on which the positions stand, as of a model's header: LAS keeps it, and so the positions exactly.
+        Without a step LAS takes the finest power of ten that its integers allow.
     crs : str or None
         WKT, kept by LAS and LAZ.
     """
@@ -52,6 +56,8 @@ class Target:
     attributes: Mapping[str, np.dtype[Any]]
     bounds: Sequence[float]
     position_error: float = 0.0
+    origin: Sequence[float] = (0.0, 0.0, 0.0)
+    step: float = 0.0
     crs: str | None = None
 
 
@@ -155,7 +161,7 @@ def _write_ply(file: BinaryIO, batches: Iterator[PointBatch], target: Target) ->
 
 def _write_xyz(file: BinaryIO, batches: Iterator[PointBatch], target: Target) -> list[str]:
     # As many decimals as the positions are good for; without a stated error, all that a float64 has.
-    decimals = max(0, int(np.ceil(-np.log10(target.position_error / 10)))) if target.position_error > 0 else None
+    decimals = max(0, int(np.ceil(-np.log10(target.position_error / 1000)))) if target.position_error > 0 else None
     order = [name for name in ("intensity", "color", "normal") if name in target.attributes]
     formats = [f"%.{min(decimals, 17)}f" if decimals is not None else "%.17g"] * 3
     for name in order:
@@ -206,10 +212,8 @@ def _las(file: BinaryIO, batches: Iterator[PointBatch], target: Target, *, compr
     import laspy  # takes longer to load than a small file to write
 
     header = laspy.LasHeader(version="1.4", point_format=_point_format(target.attributes))
-    low, high = np.array(target.bounds[:3]), np.array(target.bounds[3:])
     header.creation_date, header.generating_software = None, "pointstream"
-    header.scales = np.array([_las_scale(extent, target.position_error) for extent in high - low])
-    header.offsets = np.rint((low + high) / 2 / header.scales) * header.scales
+    header.scales, header.offsets = _las_lattice(target)
     plan, left_out = _las_dimensions(header, target)
     if target.crs is not None:
         left_out += _add_crs(header, target.crs)
@@ -218,7 +222,7 @@ def _las(file: BinaryIO, batches: Iterator[PointBatch], target: Target, *, compr
             points = laspy.ScaleAwarePointRecord.zeros(len(batch), header=header)
             for axis, name in enumerate("XYZ"):
                 steps = np.rint((batch.xyz[:, axis] - header.offsets[axis]) / header.scales[axis])
-                if not (np.abs(steps) < 2**31).all():
+                if not (np.abs(steps) <= _LAS_MOST).all():
                     raise StoreError(f"{file.name}: a position outside {tuple(target.bounds)}; nothing was written")
                 points[name] = steps
             for name, dimensions in plan.items():
@@ -236,13 +240,16 @@ def _point_format(attributes: Mapping[str, Any]) -> int:
     return 8 if "nir" in attributes else 7 if "color" in attributes else 6
 
 
-def _las_scale(extent: float, position_error: float) -> float:
-    """Power of ten as coarse as the error allows and as fine as 31 bits do; without an error the finest."""
-    reach = max(extent / 2 + position_error, np.finfo(np.float64).tiny)
-    finest = 10.0 ** np.ceil(np.log10(reach / (2**31 - 2)))
-    # Three axes, each off by at most half a step: the diagonal of such an error is below the step.
-    wanted = 10.0 ** np.floor(np.log10(position_error / 10)) if position_error > 0 else finest
-    return float(max(finest, wanted))
+def _las_lattice(target: Target) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Scales and offsets such that 32-bit integers reach over the bounds."""
+    low, high = np.array(target.bounds[:3], np.float64), np.array(target.bounds[3:], np.float64)
+    middle, reach = (low + high) / 2, np.maximum((high - low) / 2, np.finfo(np.float64).tiny)
+    scales = 10.0 ** np.ceil(np.log10(reach / (_LAS_MOST - 1)))
+    origin = np.zeros(3)
+    if target.step > 0 and (reach / target.step < _LAS_MOST - 1).all():
+        scales, origin = np.full(3, target.step), np.array(target.origin, np.float64)
+    # By whole steps from the origin to the middle: positions of a lattice that begins at a corner need every bit.
+    return scales, origin + np.rint((middle - origin) / scales) * scales
 
 
 def _las_dimensions(header: Any, target: Target) -> tuple[dict[str, tuple[str, ...]], list[str]]:

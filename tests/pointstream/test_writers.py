@@ -70,16 +70,26 @@ def test_las_and_laz(tmp_path, suffix, color):
                ("scan_angle_rank", "i1"), ("reflectance", "f4")]  # fmt: skip
     batch = samples(color=color, scalars=scalars)
     crs = pyproj.CRS.from_epsg(32718)
-    assert write(tmp_path / f"a.{suffix}", batch, position_error=0.01, crs=crs.to_wkt()) == []
+    assert write(tmp_path / f"a.{suffix}", batch, crs=crs.to_wkt()) == []
     las = laspy.read(tmp_path / f"a.{suffix}")
     assert las.header.are_points_compressed == (suffix == "laz")
-    assert np.linalg.norm(las.xyz - batch.xyz, axis=1).max() < 0.001
+    assert np.abs(las.xyz - batch.xyz).max() < 1e-6
     assert np.allclose(las.header.mins, batch.xyz.min(0), atol=0.001)
     assert np.array_equal(las.red, batch.color[:, 0] * np.uint16(257 if color == "u1" else 1))
     assert np.array_equal(np.stack([las.nx, las.ny, las.nz], axis=1), batch.normal)
     for name, _ in scalars:
         assert np.array_equal(np.asarray(las[name]), batch.attributes[name]), name
     assert las.header.parse_crs().to_epsg() == 32718
+
+
+def test_las_keeps_a_lattice_exactly(tmp_path):
+    lattice = np.random.default_rng(3).integers(0, 2**31 + 10**6, (500, 3))
+    origin, step = np.array([858000.1, 8505000.7, -3.3]), 1 / 3e5
+    batch = PointBatch(origin + step * lattice)
+    write(tmp_path / "a.las", batch, origin=origin, step=step, position_error=step)
+    las = laspy.read(tmp_path / "a.las")
+    assert las.header.scales.tolist() == [step] * 3
+    assert np.abs(las.xyz - batch.xyz).max() < 1e-8
 
 
 def test_las_is_as_fine_as_it_can_be_without_a_stated_error(tmp_path):
@@ -101,7 +111,7 @@ def test_xyz(tmp_path):
     batch = samples(scalars=[("intensity", "u2"), ("gps_time", "f8")])
     assert write(tmp_path / "a.xyz", batch, position_error=0.01) == ["gps_time"]
     table = np.loadtxt(tmp_path / "a.xyz")
-    assert np.linalg.norm(table[:, :3] - batch.xyz, axis=1).max() < 0.001
+    assert np.linalg.norm(table[:, :3] - batch.xyz, axis=1).max() < 1e-5
     assert np.array_equal(table[:, 3], batch.attributes["intensity"])
     assert np.array_equal(table[:, 4:7], batch.color)
     assert np.allclose(table[:, 7:], batch.normal, atol=1e-6)
