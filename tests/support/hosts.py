@@ -7,12 +7,12 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import httpx
+
 from pointlink import virtual
 from pointlink.memory import Network
 from pointlink.origin import Origin, serve_origin
 from pointlink.profiles import LAN, Profile
 from pointlink.resources import Resource
-
 from pointstream.stores import LocalStore, MemoryStore
 from pointstream.stores.http import HttpOptions, HttpStore
 
@@ -60,9 +60,7 @@ async def socket_store(origin: Origin, options: HttpOptions | None = None) -> As
     """An HTTP store over a real loopback socket."""
     server = await serve_origin(origin)
     port = server.sockets[0].getsockname()[1]
-    store = HttpStore(
-        f"http://127.0.0.1:{port}{PATH}", clock=asyncio.get_running_loop().time, options=options
-    )
+    store = HttpStore(f"http://127.0.0.1:{port}{PATH}", clock=asyncio.get_running_loop().time, options=options)
     try:
         yield store
     finally:
