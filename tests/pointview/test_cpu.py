@@ -13,7 +13,7 @@ from pointview.camera import Camera
 from pointview.refine import refine
 from pointview.render import Style, open_backend
 from pointview.render.cpu import CpuBackend
-from pointview.render.picture import YELLOW, save_png, starved_pixels, tint_starved
+from pointview.render.picture import YELLOW, save_png, tint_starved
 from pointview.splats import CLOSING, LARGEST, ROUND, ROUND_FROM
 
 
@@ -220,15 +220,15 @@ def test_starved_pixels_are_tinted(tmp_path):
     camera = camera_at((1, -2.5, 2), width=120, height=90)
     cut = refine(model.index, camera, 1.0, model.first(6))
     frame = CpuBackend(model.header).draw(cut, model.take, camera, Style())
-    where = starved_pixels(frame, cut)
+    where = frame.starved
     np.testing.assert_array_equal(where, np.isin(frame.node, cut.nodes[cut.starved]))
     assert where.any()
-    twin = tint_starved(frame, cut)
+    twin = tint_starved(frame)
     np.testing.assert_array_equal(twin[~where], frame.rgb[~where])
     np.testing.assert_allclose(twin[where], (frame.rgb[where] + np.array(YELLOW)) / 2, atol=0.51)
     full = refine(model.index, camera, 1.0, model.everything)
     whole = CpuBackend(model.header).draw(full, model.take, camera, Style())
-    assert not starved_pixels(whole, full).any()
+    assert not whole.starved.any()
     from PIL import Image
 
     save_png(twin, tmp_path / "twin.png")

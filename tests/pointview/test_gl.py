@@ -55,6 +55,7 @@ def assert_same(frame, oracle, share=SHARE):
     both = np.isfinite(frame.depth) & np.isfinite(oracle.depth)
     expected = oracle.depth[both]
     assert (np.abs(frame.depth[both] - expected) > 1e-5 * expected).mean() <= share
+    assert (frame.starved != oracle.starved)[covered].mean() <= 4 * share
     assert (frame.splats, frame.clouds) == (oracle.splats, oracle.clouds)
 
 

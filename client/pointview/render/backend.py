@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from lpc.cloud import Cloud
     from pointview.camera import Camera
     from pointview.refine import Cut
@@ -53,6 +54,8 @@ class Frame:
         Distance along the viewing direction, model units; infinite where nothing was drawn.
     node : (h, w) int32
         The node whose sample is seen; -1 where nothing was drawn.
+    starved : (h, w) bool
+        Pixels whose sample belongs to a starved node: the yellow patches of LPC figure 5.
     splats, clouds : int
         Samples and clouds submitted.
     uploads : int
@@ -62,9 +65,17 @@ class Frame:
     rgb: NDArray[np.uint8]
     depth: NDArray[np.float32]
     node: NDArray[np.int32]
+    starved: NDArray[np.bool_]
     splats: int
     clouds: int
     uploads: int
+
+
+def starved_pixels(node: NDArray[np.int32], cut: Cut) -> NDArray[np.bool_]:
+    """Which pixels of a `Frame.node` show a starved node of the cut it was drawn from."""
+    starved = np.zeros(int(cut.nodes[-1]) + 2 if len(cut.nodes) else 1, dtype=bool)
+    starved[cut.nodes] = cut.starved
+    return starved[node]  # -1 is the last entry, false
 
 
 class Backend(Protocol):

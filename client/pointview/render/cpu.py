@@ -5,23 +5,25 @@ The default where there is no graphics hardware, the renderer of batch pictures,
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pointview.splats import CLOSING, LARGEST, ROUND, ROUND_FROM
 
 from . import kernels
 from .arena import Arena
-from .backend import Frame, Style, Take
+from .backend import Frame, Style, Take, starved_pixels
 from .pack import Packer
 from .shading import RADIUS, lamp
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
     from lpc.header import Header
     from pointview.camera import Camera
     from pointview.refine import Cut
@@ -88,7 +90,7 @@ class CpuBackend:
             )  # fmt: skip
 
         self._in_parallel(splat)
-        return self._resolve(draw, camera, style, rotation, uploads)
+        return self._resolve(draw, cut, camera, style, rotation, uploads)
 
     def close(self) -> None:
         """Stop the threads."""
@@ -127,7 +129,9 @@ class CpuBackend:
             size=(cut.spacing * (CLOSING * camera.focal)).astype(np.float32),
         )
 
-    def _resolve(self, draw: _Draw, camera: Camera, style: Style, rotation: NDArray[np.float32], uploads: int) -> Frame:
+    def _resolve(
+        self, draw: _Draw, cut: Cut, camera: Camera, style: Style, rotation: NDArray[np.float32], uploads: int
+    ) -> Frame:
         shape = (camera.height, camera.width)
         rgb = np.empty((*shape, 3), dtype=np.uint8)
         depth = np.empty(shape, dtype=np.float32)
@@ -155,7 +159,13 @@ class CpuBackend:
         if dims:
             self._in_parallel(lambda worker: kernels.eye_dome(rgb, depth, *rows(worker), factor))
         return Frame(
-            rgb=rgb, depth=depth, node=node, splats=int(draw.count.sum()), clouds=len(draw.nodes), uploads=uploads
+            rgb=rgb,
+            depth=depth,
+            node=node,
+            starved=starved_pixels(node, cut),
+            splats=cut.splats,
+            clouds=len(cut.nodes),
+            uploads=uploads,
         )
 
     def _in_parallel(self, work: Callable[[int], None]) -> None:

@@ -16,17 +16,18 @@ from typing import TYPE_CHECKING, Any
 
 import moderngl
 import numpy as np
-from numpy.typing import NDArray
 
 from lpc.errors import Unavailable
 from pointview.splats import CLOSING, LARGEST, ROUND, ROUND_FROM
 
 from . import shading
 from .arena import Arena
-from .backend import Frame, Style, Take
+from .backend import Frame, Style, Take, starved_pixels
 from .pack import SAMPLE_BYTES, Packer
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from lpc.header import Header
     from pointview.camera import Camera
     from pointview.refine import Cut
@@ -94,16 +95,16 @@ class GlBackend:
         context.enable_only(moderngl.DEPTH_TEST | moderngl.PROGRAM_POINT_SIZE)
         context.depth_func = "<"
         self._set_uniforms(camera, style, cut.depth_range)
-        uploads = splats = 0
+        uploads = 0
         for start in range(0, len(cut.nodes), self._arena.slots):
             part = slice(start, start + self._arena.slots)
             uploads += self._upload(cut.nodes[part], take)
-            splats += self._submit(cut.nodes[part], cut.spacing[part], camera)
+            self._submit(cut.nodes[part], cut.spacing[part], camera)
         source = self._target
         if not self._packer.has_normals and style.edl_strength > 0:
             self._eye_dome(camera, style)
             source = self._dimmed
-        return self._read(source, camera, splats=splats, clouds=len(cut.nodes), uploads=uploads)
+        return self._read(source, camera, cut, uploads)
 
     def close(self) -> None:
         """Release the context and all that it holds."""
@@ -166,8 +167,8 @@ class GlBackend:
             self._arena.put(slot, packed)
         return len(absent)
 
-    def _submit(self, nodes: NDArray[np.int64], spacing: NDArray[np.float32], camera: Camera) -> int:
-        """Draw nodes that are in the arena; return their number of samples."""
+    def _submit(self, nodes: NDArray[np.int64], spacing: NDArray[np.float32], camera: Camera) -> None:
+        """Draw nodes that are in the arena."""
         slots = self._arena.slots_of(nodes)
         counts = self._arena.count[slots]
         placement = np.empty(len(nodes), dtype=PLACEMENT)
@@ -183,7 +184,7 @@ class GlBackend:
             self._placements.write(placement)
             self._commands.write(commands)
             self._points.render_indirect(self._commands, moderngl.POINTS, len(nodes))
-            return int(counts.sum())
+            return
         offset, scale, node = (self._program[name] for name in ("offset", "placement", "node"))
         rows = zip(placement, counts.tolist(), first.tolist(), strict=True)
         for row, count, start in rows:
@@ -191,7 +192,6 @@ class GlBackend:
             scale.write(row["placement"].tobytes())
             node.write(row["node"].tobytes())
             self._points.render(moderngl.POINTS, vertices=count, first=start)
-        return int(counts.sum())
 
     def _set_uniforms(self, camera: Camera, style: Style, depth_range: tuple[float, float]) -> None:
         surface = (255, 255, 255) if self._packer.has_colors else style.surface
@@ -222,17 +222,22 @@ class GlBackend:
         self._dimmer["factor"].value = style.edl_strength * camera.focal / (8 * shading.RADIUS)
         self._triangle.render(moderngl.TRIANGLES, vertices=3)
 
-    def _read(self, source: Any, camera: Camera, *, splats: int, clouds: int, uploads: int) -> Frame:
+    def _read(self, source: Any, camera: Camera, cut: Cut, uploads: int) -> Frame:
         shape = (camera.height, camera.width)
         rgba = np.frombuffer(source.read(components=4), dtype=np.uint8).reshape(*shape, 4)
         depth = np.frombuffer(self._target.read(components=1, attachment=1, dtype="f4"), dtype="<f4").reshape(shape)
-        node = np.frombuffer(self._target.read(components=1, attachment=2, dtype="i4"), dtype="<i4").reshape(shape)
+        node = (
+            np.frombuffer(self._target.read(components=1, attachment=2, dtype="i4"), dtype="<i4")
+            .reshape(shape)[::-1]
+            .copy()
+        )
         return Frame(
             rgb=np.ascontiguousarray(rgba[::-1, :, :3]),
             depth=np.where(depth[::-1] >= EMPTY, np.float32(np.inf), depth[::-1]),
-            node=np.ascontiguousarray(node[::-1]),
-            splats=splats,
-            clouds=clouds,
+            node=node,
+            starved=starved_pixels(node, cut),
+            splats=cut.splats,
+            clouds=len(cut.nodes),
             uploads=uploads,
         )
 

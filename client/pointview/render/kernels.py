@@ -9,12 +9,15 @@ looks up, once per pixel and not once per splat, which sample is seen, and light
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from .shading import AMBIENT, DIFFUSE, RADIUS, SHININESS, SPECULAR, UNLIT
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 EMPTY = np.uint64(0xFFFFFFFFFFFFFFFF)
 BLOCK_BITS = 8

@@ -20,9 +20,12 @@ resolution of the picture nor on the distance to the model.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 LAMP = (-0.35, 0.55, 1.0)
 """Direction to the lamp in camera space: right, up, toward the eye; normalised by `lamp`."""
