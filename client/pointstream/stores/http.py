@@ -11,8 +11,9 @@ from __future__ import annotations
 import asyncio
 import base64
 import random
+from contextlib import aclosing
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import httpx
 
@@ -25,7 +26,7 @@ from .patience import PatienceOptions, Tries, overdue
 from .replies import Beyond, Moved, Part, Pins, Retry, Whole, judge, ranges_unsupported
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import AsyncGenerator, Callable
 
     from .base import Sink
 
@@ -213,27 +214,27 @@ class HttpStore:
 
     async def _take_part(self, response: httpx.Response, part: Part, body: _Body, watch: _Watch, lane: Lane) -> None:
         offset = part.start
-        assert isinstance(response.stream, httpx.AsyncByteStream)
-        async for chunk in response.stream:
-            watch.count(len(chunk))
-            if offset + len(chunk) > part.stop:
-                raise Retry("more bytes than the reply's Content-Range says")
-            body.feed(offset, chunk)
-            offset += len(chunk)
-            if body.complete and part.stop - offset > DRAINED:
-                lane.spoiled = True
-                return
+        async with _chunks(response) as chunks:
+            async for chunk in chunks:
+                watch.count(len(chunk))
+                if offset + len(chunk) > part.stop:
+                    raise Retry("more bytes than the reply's Content-Range says")
+                body.feed(offset, chunk)
+                offset += len(chunk)
+                if body.complete and part.stop - offset > DRAINED:
+                    lane.spoiled = True
+                    return
         if offset < part.stop:
             raise Retry(f"the body ended {part.stop - offset} bytes early")
 
     async def _take_whole(self, response: httpx.Response, whole: Whole, watch: _Watch) -> None:
         data = bytearray()
-        assert isinstance(response.stream, httpx.AsyncByteStream)
-        async for chunk in response.stream:
-            watch.count(len(chunk))
-            data += chunk
-            if len(data) > whole.limit:
-                raise ranges_unsupported(self.host, whole.length)
+        async with _chunks(response) as chunks:
+            async for chunk in chunks:
+                watch.count(len(chunk))
+                data += chunk
+                if len(data) > whole.limit:
+                    raise ranges_unsupported(self.host, whole.length)
         if whole.length is not None and len(data) != whole.length:
             raise Retry(f"the body has {len(data)} bytes in place of {whole.length}")
         self._whole, self.length = bytes(data), len(data)
@@ -315,6 +316,12 @@ class _Watch:
     def _postpone(self) -> None:
         rate = self._meter.rate(self._clock())
         self.limit.reschedule(overdue(self._sent, self.received, rate, self._patience))
+
+
+def _chunks(response: httpx.Response) -> aclosing[AsyncGenerator[bytes, None]]:
+    """Give the raw body, ended properly wherever the loop over it is left."""
+    assert isinstance(response.stream, httpx.AsyncByteStream)
+    return aclosing(cast("AsyncGenerator[bytes, None]", aiter(response.stream)))
 
 
 def _parse_address(address: str) -> tuple[httpx.URL, list[tuple[str, str]]]:
