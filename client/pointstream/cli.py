@@ -156,7 +156,7 @@ def _rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "levels", str(facts["levels"])
     yield "bytes", f"{facts['bytes']:,}"
     if not facts["complete"]:
-        yield "incomplete", f"only the first {facts['bytes_here']:,} bytes are here: a coarser model"
+        yield "incomplete", "the file was cut short: what is here is a coarser model"
     yield "bits per sample", ", ".join(f"{name} {value:.2f}" for name, value in bits.items() if value)
     yield "spacing", f"{facts['spacing']:.6g}"
     yield "spacing, stored / LPC", " ".join(f"{ratio:.3f}" for ratio in facts["spacing_ratio"]) + "  (5%, 50%, 95%)"
