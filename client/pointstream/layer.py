@@ -140,11 +140,6 @@ class AccessLayer:
         return self._wanted.anything
 
     @property
-    def wanting(self) -> bool:
-        """Whether anything is missing that the last frame wanted and that can be had."""
-        return self._wanted.anything
-
-    @property
     def stats(self) -> LayerStats:
         """What was counted so far."""
         now, meter, residency = self._clock(), self._store.meter, self._now.residency

@@ -59,11 +59,6 @@ class Wanted:
         """Whether anything is wanted that can still come."""
         return self._since is not None
 
-    @property
-    def anything(self) -> bool:
-        """Whether something is wanted now."""
-        return self._since is not None
-
     def seconds(self, now: float) -> float:
         """Sum up the time in which anything was wanted."""
         return self._total + (0.0 if self._since is None else now - self._since)
