@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import sys
 import time
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -61,7 +60,7 @@ def verify(model: str, scans: tuple[str, ...], more: tuple[str, ...], as_json: b
     else:
         _print_report(report)
     if not report.ok:
-        sys.exit(1)
+        click.get_current_context().exit(1)
 
 
 def _parse_bounds(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[float, ...] | None:
