@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 BITS = 48
 """Of a fixed point coordinate, as many as a stored position may have: samples that share all are at one place."""
 
+LARGEST, SMALLEST = 1e36, 1e-24
+"""Longest side of a root box, model units."""
+
 _CHUNK = 10  # bits of a look-up table
 
 
@@ -64,12 +67,16 @@ class Cells:
         Raises
         ------
         BuildError
-            If the box is too large for float64.
+            If the box is larger or smaller than spheres of float32 can say.
         """
         with np.errstate(over="ignore"):
             extent = high - low
-        if not np.isfinite(extent).all():
-            raise BuildError("the samples are further apart than a float64 can say: remove the outliers")
+        longest = float(extent.max())
+        if longest > LARGEST or 0 < longest < SMALLEST:
+            raise BuildError(
+                f"the samples spread over {longest:.3g}: a model spans {SMALLEST:g} to {LARGEST:g} units; "
+                "remove outliers or choose another unit"
+            )
         sides, used = extent.copy(), np.zeros(3, dtype=np.int64)
         axes: list[int] = []
         shifts: list[int] = []

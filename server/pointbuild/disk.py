@@ -41,12 +41,17 @@ def check_space(samples: int, scratch: Path, out: Path, spool_bytes: int, row_by
     if scratch.stat().st_dev == out.parent.stat().st_dev:
         needs = {scratch: max(temporary, samples * row_bytes + 2 * model)}
     for folder, need in needs.items():
-        free = shutil.disk_usage(folder).free
+        free = free_bytes(folder)
         if need > free:
             raise BuildError(
                 f"the build needs about {_size(need)} in {folder.parent if folder == scratch else folder}, which has "
                 f"{_size(free)} free: make room, or choose another place for temporary files (--scratch)"
             )
+
+
+def free_bytes(folder: Path) -> int:
+    """Bytes that may still be written in a directory."""
+    return shutil.disk_usage(folder).free
 
 
 @contextmanager

@@ -154,7 +154,8 @@ class Records:
         )
         axis = geometry.axis.astype(np.float64)
         angle = 2 * np.arcsin(np.minimum(np.sqrt(self._spread) / 2, 1))
-        angle[~axis.any(axis=1)] = np.pi
+        # Wider than a half space never culls (`lpc.bounds.backfacing`), and chords measure badly there.
+        angle[~axis.any(axis=1) | (angle > np.pi / 2)] = np.pi
         axis[~axis.any(axis=1)] = (0, 0, 1)
         self.records["cone_axis"], self.records["cone_angle"] = quantise_cones(axis, angle)
         return self.records

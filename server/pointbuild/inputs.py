@@ -126,11 +126,11 @@ def _common(scans: tuple[Scan, ...], left_out: dict[str, str]) -> dict[str, np.d
     names = dict.fromkeys(name for scan in scans for name in scan.info.attributes)
     common = {}
     for name in names:
-        dtypes = [scan.info.attributes.get(name) for scan in scans]
-        if None in dtypes:
-            where = next(scan for scan, dtype in zip(scans, dtypes, strict=True) if dtype is None)
-            left_out[name] = f"{where.info.path.name} has none"
-        elif len({np.dtype(dtype) for dtype in dtypes}) > 1:
+        dtypes = [scan.info.attributes[name] for scan in scans if name in scan.info.attributes]
+        if len(dtypes) < len(scans):
+            where = next(scan.info.path.name for scan in scans if name not in scan.info.attributes)
+            left_out[name] = f"{where} has none"
+        elif len(set(dtypes)) > 1:
             left_out[name] = f"its type differs between the scans ({dtypes[0]} and others)"
         else:
             left_out.pop(name, None)

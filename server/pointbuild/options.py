@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from lpc.codec import Effort
 
 MAX_CLOUD_SIZE = 65535
-"""Also what a cloud holds at most of samples that coincide; more than that become a chain of nodes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

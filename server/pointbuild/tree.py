@@ -15,8 +15,7 @@ from numba import njit
 
 from lpc.errors import BuildError
 from lpc.header_checks import MAX_LEVELS
-
-from .options import MAX_CLOUD_SIZE
+from lpc.page import COINCIDENT
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -99,8 +98,8 @@ def grow(
     )  # fmt: skip
     if count < 0:
         raise BuildError(
-            f"more samples stand at one place than a tree of {MAX_LEVELS} levels can hold (about "
-            f"{(MAX_LEVELS - cells.depths) * MAX_CLOUD_SIZE:,}): remove the duplicates"
+            f"too many samples stand at one place for a tree of {MAX_LEVELS} levels of at most {COINCIDENT:,}: "
+            "remove the duplicates"
         )
     return Tree(*nodes[:, :count].copy()), owner
 
@@ -131,7 +130,7 @@ def _grow(
         for axis in range(3):
             coincide = coincide and fixed[low, axis] == fixed[high - 1, axis]
         remain = end - begin
-        take = min(remain, max(cloud_size, 65535) if coincide else cloud_size)
+        take = min(remain, max(cloud_size, COINCIDENT) if coincide else cloud_size)
         nodes[0, node], nodes[1, node], nodes[2, node] = parent, half, depth
         nodes[3, node], nodes[4, node], nodes[5, node], nodes[6, node] = low, high, remain, take
         if take == remain:

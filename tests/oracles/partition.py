@@ -19,7 +19,7 @@ COINCIDENT = 65535
 
 @dataclass(frozen=True)
 class Node:
-    """`own` are the samples of the node's cloud, `cell` all samples in its cell, `subtree` those that no ancestor took."""
+    """`own`: samples of the node's cloud; `cell`: all in its cell; `subtree`: those of them that no ancestor took."""
 
     depth: int
     own: frozenset[int]

@@ -35,7 +35,7 @@ def check(xyz: NDArray[np.float64], built: Built, cloud_size: int, seed: int = 0
 
 SCANS = {
     "surface": surfaces.bumpy(700, seed=1).xyz,
-    "sphere far away": surfaces.sphere(500, seed=2).xyz + [5e6, -3e6, 100.0],
+    "sphere far away": surfaces.sphere(500, seed=2).xyz + np.array([5e6, -3e6, 100.0]),
     "clump and outlier": np.concatenate([surfaces.sphere(400, seed=3).xyz * 1e-6, [[1e3, 2e3, 3e3]]]),
     "line": np.linspace(0, 1, 300)[:, None] * [1.0, 2.0, -3.0],
     "plane": np.stack([*np.meshgrid(np.arange(20.0), np.arange(20.0)), np.zeros((20, 20))], axis=-1).reshape(-1, 3),
