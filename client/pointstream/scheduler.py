@@ -70,12 +70,12 @@ class SchedulerOptions:
     """
 
     request_seconds: float = 0.125
-    smallest_request: int = 4096
+    smallest_request: int = 8192
     largest_request: int = 1 << 19
     overhead: int = 400
     look_seconds: float = 1 / 30
     gain: float = 1.25
-    most_requests: int = 6
+    most_requests: int = 8
     most_window: int = 4 << 20
     local_window: int = 1 << 20
     local_gap: int = 4096

@@ -51,7 +51,7 @@ class HttpOptions:
         Waiting and retrying.
     """
 
-    lanes: int = 6
+    lanes: int = 8
     headers: tuple[tuple[str, str], ...] = ()
     patience: PatienceOptions = field(default_factory=PatienceOptions)
 
