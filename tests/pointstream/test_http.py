@@ -13,6 +13,7 @@ import pytest
 from support.hosts import (
     ADDRESS,
     Pieces,
+    Script,
     honest,
     origin_of,
     range_of,
@@ -280,6 +281,35 @@ def test_redirects_never_lead_back_to_plain_text_or_round_in_circles() -> None:
         assert len(host.requests) <= 7
 
     script(lambda number, _: reply(307, location=f"/{number % 2}"), round_)
+
+
+def test_connections_for_plain_text_are_not_used_after_a_change_to_tls() -> None:
+    moved = False
+    made: list[Script] = []
+
+    def answer(number: int, request: httpx.Request) -> httpx.Response:
+        if moved and request.url.scheme == "http":
+            return reply(308, location="https://host.test/model.lpc")
+        return honest(DATA, request)
+
+    def transport() -> Script:
+        made.append(Script(answer))
+        return made[-1]
+
+    async def run() -> None:
+        nonlocal moved
+        store = HttpStore(ADDRESS, clock=asyncio.get_running_loop().time, transports=transport)
+        await asyncio.gather(*(store.read(FIRST) for _ in range(3)))
+        plain, moved = len(made), True
+        for _ in range(4):
+            await asyncio.gather(*(store.read(LATER) for _ in range(3)))
+        await store.close()
+        assert plain >= 1
+        for script in made[:plain]:
+            assert all(request.url.scheme == "http" for request in script.requests)
+        assert all(script.closed == 1 for script in made)
+
+    virtual.run(run())
 
 
 @pytest.mark.parametrize(("status", "error"), [(403, StoreError), (404, NotFound), (410, NotFound), (400, StoreError)])

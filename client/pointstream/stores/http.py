@@ -98,7 +98,8 @@ class HttpStore:
         self._clock = clock
         self._rng = rng or random.Random(0)
         self._headers = [*headers, *self.options.headers]
-        self._lanes = Lanes(transports or plain_transports(address), self.options.lanes)
+        self._own_transports = transports is None
+        self._lanes = Lanes(transports or plain_transports(tls=self._url.scheme == "https"), self.options.lanes)
         self._pins = Pins()
         self._whole: bytes | None = None
         self._past_caches = False
@@ -249,6 +250,8 @@ class HttpStore:
         here, there = (self._url.scheme, self._url.port), (target.scheme, target.port)
         if target.host != self._url.host or not (here == there or upgraded):
             raise StoreError(f"{self.name} redirects to {target}: open that address if you trust it")
+        if upgraded:  # connections made for plain text would not check certificates
+            self._lanes.renew(plain_transports(tls=True) if self._own_transports else None)
         self._url = target
 
 
