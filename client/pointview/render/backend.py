@@ -33,6 +33,10 @@ class Style:
         Colour of models that carry none.
     two_sided : bool
         Light both sides of a surface and drop no sample that faces away: for normals that may point inward.
+    oriented : bool
+        Draw samples with normals as discs in their tangent plane; False: as discs that face the eye.
+    close_holes : bool
+        Paint pixels that a nearer surface encloses within a splat's width with that surface, see `splats`.
     edl_strength : float
         Eye-dome lighting of models without normals: slope that darkens by 1/e, see `shading`; 0 switches it off.
     """
@@ -40,7 +44,9 @@ class Style:
     background: Rgb = (18, 21, 26)
     surface: Rgb = (214, 208, 196)
     two_sided: bool = False
-    edl_strength: float = 0.35
+    oriented: bool = True
+    close_holes: bool = True
+    edl_strength: float = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
