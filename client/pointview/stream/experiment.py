@@ -26,11 +26,15 @@ from .session import Moment, Recording, SessionOptions, record
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+    from contextlib import AbstractContextManager
 
     from lpc.header import Header
     from pointlink.profiles import Profile
 
     from .path import ViewPath
+
+    Progress = Callable[[str, int], AbstractContextManager[Callable[[int], None]]]
+    """`pointstream.progress.progress`, or what stands in for it."""
 
 MOST_THREADS = 8
 
@@ -86,13 +90,17 @@ class Experiment:
         )
 
 
-def run_experiment(experiment: Experiment, *, say: Callable[[str], None]) -> tuple[Report, list[Moment]]:
+def run_experiment(
+    experiment: Experiment, *, say: Callable[[str], None], progress: Progress
+) -> tuple[Report, list[Moment]]:
     """Run an experiment and compare its pictures with the same views fully resident.
 
     Parameters
     ----------
     say : callable
         Told what is going on, a line at a time.
+    progress : callable
+        Shows how far a stage with so many steps is.
 
     Raises
     ------
@@ -103,20 +111,39 @@ def run_experiment(experiment: Experiment, *, say: Callable[[str], None]) -> tup
     say("drawing the whole view for comparison")
     references = asyncio.run(_references(experiment, [0.0]))
     say(f"streaming for {experiment.seconds:g} s ({experiment.clock} clock) over {experiment.profile}")
-    recording = network.run(experiment.clock, _stream(experiment))
+    with progress("streaming, seconds", max(1, int(experiment.seconds))) as advance:
+        recording = network.run(experiment.clock, _stream(experiment, _whole_seconds(advance)))
     if experiment.views is not None and experiment.views.moves:
         say("drawing the path for comparison")
         references = asyncio.run(_references(experiment, [moment.t for moment in recording.moments]))
     else:
         references = references * len(recording.moments)
-    return _report(experiment, recording, references), recording.moments
+    with progress("comparing pictures", len(recording.moments)) as advance:
+        curve = []
+        for moment, reference in zip(recording.moments, references, strict=True):
+            curve.append(_entry(moment, reference))
+            advance(1)
+    return _report(experiment, recording, curve), recording.moments
 
 
-async def _stream(experiment: Experiment) -> Recording:
+def _whole_seconds(advance: Callable[[int], None]) -> Callable[[float], None]:
+    """Turn times into steps of a second."""
+    told = 0
+
+    def tell(t: float) -> None:
+        nonlocal told
+        if (whole := int(t)) > told:
+            advance(whole - told)
+            told = whole
+
+    return tell
+
+
+async def _stream(experiment: Experiment, tell: Callable[[float], None]) -> Recording:
     clock = asyncio.get_running_loop().time
     async with network.open_link(experiment.model, experiment.profile, experiment.clock) as connect:
         opening = AccessLayer.open(connect(), options=LayerOptions(capacity=CAPACITY), clock=clock)
-        return await record(opening, experiment.camera_at, experiment.session, clock)
+        return await record(opening, experiment.camera_at, experiment.session, clock, tell=tell)
 
 
 async def _references(experiment: Experiment, times: Sequence[float]) -> list[Frame]:
@@ -144,8 +171,9 @@ def _look(layer: AccessLayer, *, camera: Camera, tolerance: float) -> Any:
     return refine(layer.index, camera, tolerance, layer.resident)
 
 
-def _report(experiment: Experiment, recording: Recording, references: Sequence[Frame]) -> Report:
+def _report(experiment: Experiment, recording: Recording, curve: Sequence[dict[str, Any]]) -> Report:
     assert recording.stats is not None
+    assert recording.header is not None
     stats, rate = recording.stats, experiment.profile.down_rate
     could_carry = None if rate is None else rate / 8.0 * stats.wanted_seconds
     return Report(
@@ -155,18 +183,20 @@ def _report(experiment: Experiment, recording: Recording, references: Sequence[F
         priority=experiment.priority,
         size=experiment.size,
         seconds=experiment.seconds,
-        samples=recording.moments[-1].splats if recording.moments else 0,
+        samples=recording.samples,
         bytes=stats.bytes_received,
         requests=stats.requests,
         link_utilisation=None if not could_carry else min(1.0, stats.payload_bytes / could_carry),
         first_picture_s=recording.first_picture_s,
         settled_s=recording.settled_s,
         tolerance=experiment.tolerance,
+        model_samples=recording.header.samples,
+        model_bytes=recording.header.bytes,
         payload_bytes=stats.payload_bytes,
         wanted_s=stats.wanted_seconds,
         frames=recording.frames,
         errors=tuple(f"{error.text} ({error.count} times)" for error in stats.errors),
-        curve=tuple(_entry(m, reference) for m, reference in zip(recording.moments, references, strict=True)),
+        curve=tuple(curve),
     )
 
 

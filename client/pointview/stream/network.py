@@ -18,10 +18,11 @@ import asyncio
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar
+from urllib.parse import urlsplit
 
 import httpx
 
-from lpc.errors import LpcError, RangesUnsupported, Unavailable
+from lpc.errors import LpcError, RangesUnsupported, StoreError, Unavailable
 from lpc.ranges import parse_content_range
 from pointlink import virtual
 from pointlink.front import parse_upstream, precise_loop, serve_front
@@ -99,9 +100,20 @@ async def open_link(target: str, profile: Profile, kind: ClockKind) -> AsyncIter
                 server = await stack.enter_async_context(await serve_origin(origin))
                 host, port = server.sockets[0].getsockname()[:2]
                 address = f"http://{host}:{port}{MODEL}"
-            front = await stack.enter_async_context(await serve_front(parse_upstream(address), profile))
-            through = front.url
+            through = await stack.enter_async_context(_front(address, profile))
             yield lambda: HttpStore(through, clock=clock)
+
+
+@asynccontextmanager
+async def _front(address: str, profile: Profile) -> AsyncIterator[str]:
+    """Put a throttled front before an address; yield the address that stands for it."""
+    try:
+        upstream = parse_upstream(address)
+    except ValueError as error:
+        raise StoreError(str(error)) from error
+    async with await serve_front(upstream, profile) as front:
+        login, at, _ = urlsplit(address).netloc.rpartition("@")
+        yield front.url.replace("://", f"://{login}{at}", 1)
 
 
 def _remote_resource(address: str, stack: AsyncExitStack) -> Resource:
@@ -115,6 +127,8 @@ def _remote_resource(address: str, stack: AsyncExitStack) -> Resource:
             reply = client.get(address, headers={"Range": f"bytes={start}-{stop - 1}"})
             reply.raise_for_status()
             _, _, total = parse_content_range(reply.headers.get("Content-Range", ""))
+        except httpx.InvalidURL as error:
+            raise StoreError(f"{address} is no address: {error}") from error
         except httpx.HTTPError as error:
             raise Unavailable(f"{address}: cannot be read: {error}") from error
         except (LpcError, ValueError) as error:

@@ -27,7 +27,7 @@ INK, FIRST, SECOND, THIRD = "#333333", "#1f6feb", "#d97706", "#6b7280"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Report:
-    """The figures of one run; field names are the contract's."""
+    """The figures of one run; field names are those of report.json, see docs/streaming.md."""
 
     model: str
     link: str
@@ -42,11 +42,41 @@ class Report:
     first_picture_s: float | None
     settled_s: float | None
     tolerance: float
+    model_samples: int
+    model_bytes: int
     payload_bytes: int
     wanted_s: float
     frames: int
     errors: tuple[str, ...]
     curve: tuple[dict[str, Any], ...]
+
+
+def prepare_folder(folder: Path) -> None:
+    """Make the report's folder and take the pictures of an earlier run out of it.
+
+    Raises
+    ------
+    StoreError
+        If the folder cannot be made or written: better known before a run than after it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for old in (
+            folder / "report.json",
+            folder / "curve.png",
+            *folder.glob("frame-[0-9]*s.png"),
+            *folder.glob("frame-[0-9]*s-starved.png"),
+        ):
+            old.unlink(missing_ok=True)
+        trial = folder / "report.json"
+        trial.touch()
+        trial.unlink()
+    except OSError as error:
+        raise _cannot_write(folder, error) from error
+
+
+def _cannot_write(folder: Path, error: OSError) -> StoreError:
+    return StoreError(f"{folder}: the report cannot be written there: {error.strerror or error}")
 
 
 def write_report(folder: Path, report: Report, moments: Sequence[Moment]) -> list[Path]:
@@ -77,7 +107,7 @@ def write_report(folder: Path, report: Report, moments: Sequence[Moment]) -> lis
         written.append(folder / "curve.png")
         plot_curve(written[-1], report)
     except OSError as error:
-        raise StoreError(f"{folder}: the report cannot be written: {error.strerror or error}") from error
+        raise _cannot_write(folder, error) from error
     return written
 
 
@@ -114,7 +144,8 @@ def plot_curve(path: Path, report: Report) -> None:
         shape.set_ylabel("starved area, %", color=SECOND)
         shape.set_ylim(bottom=0.0)
         spacing = shape.twinx()
-        spacing.plot(t, [max(entry["max_spacing_px"], 1e-3) for entry in report.curve], color=FIRST, linewidth=1.2)
+        widest = [entry["max_spacing_px"] if entry["splats"] else np.nan for entry in report.curve]
+        spacing.plot(t, widest, color=FIRST, linewidth=1.2)
         spacing.axhline(report.tolerance, color=THIRD, linewidth=0.8, linestyle=":")
         spacing.set_yscale("log")
         spacing.set_ylabel("widest spacing, pixels", color=FIRST)

@@ -135,6 +135,10 @@ class Recording:
     frames : int
     longest_frame_s : float
         Longest time that one frame held the loop up; only a real clock sees any.
+    samples : int
+        Samples resident at the end: those that were received, unless the capacity of the layer was too small.
+    header : Header, optional
+        Of the model that was there at the end.
     """
 
     moments: list[Moment] = field(default_factory=list)
@@ -143,14 +147,20 @@ class Recording:
     settled_s: float | None = None
     frames: int = 0
     longest_frame_s: float = 0.0
+    samples: int = 0
+    header: Header | None = None
 
 
 def look_times(seconds: float) -> list[float]:
-    """Moments worth a picture: every 0.1 s for two seconds, every 0.25 s up to five, every 0.5 s after."""
-    times = {round(seconds, 3)}
+    """Moments worth a picture: every 0.1 s for two seconds, every 0.25 s up to five, every 0.5 s after, and the end."""
+    times: set[float] = set()
     for start, stop, every in ((0.0, 2.0, 0.1), (2.0, 5.0, 0.25), (5.0, seconds, 0.5)):
         times |= {round(start + every * k, 3) for k in range(1, round((stop - start) / every) + 1)}
-    return sorted(t for t in times if t <= seconds)
+    return [*sorted(t for t in times if t < seconds - 1e-3), seconds]
+
+
+def _nobody(_t: float) -> None:
+    return None
 
 
 async def record(
@@ -158,6 +168,8 @@ async def record(
     camera_at: Callable[[Header, float], Camera],
     options: SessionOptions,
     clock: Clock,
+    *,
+    tell: Callable[[float], None] = _nobody,
 ) -> Recording:
     """Run one session.
 
@@ -170,6 +182,8 @@ async def record(
     options : SessionOptions
     clock : callable
         Monotonic seconds, of the running loop.
+    tell : callable
+        Told the time of the run in seconds at every frame.
 
     Raises
     ------
@@ -180,7 +194,7 @@ async def record(
     layer = await opening
     try:
         with ThreadPoolExecutor(1, thread_name_prefix="draw") as drawer:  # one thread: GL contexts stay on theirs
-            return await _Session(layer, camera_at, options, clock, start, drawer).run()
+            return await _Session(layer, camera_at, options, clock, start, drawer, tell).run()
     finally:
         await layer.close()
 
@@ -196,9 +210,10 @@ class _Session:
         clock: Clock,
         start: float,
         drawer: ThreadPoolExecutor,
+        tell: Callable[[float], None],
     ) -> None:
         self.layer, self.camera_at, self.options = layer, camera_at, options
-        self.clock, self.start, self.drawer = clock, start, drawer
+        self.clock, self.start, self.drawer, self.tell = clock, start, drawer, tell
         self.recording = Recording()
 
     async def run(self) -> Recording:
@@ -210,12 +225,17 @@ class _Session:
         try:
             due = [self.start + t for t in look_times(options.seconds)]
             next_frame = clock()
-            while due:
+            while True:
                 now = clock()
                 cut, camera = self._frame(now - self.start)
+                self.tell(now - self.start)
                 if now >= due[0]:
                     due = [t for t in due if t > now]
+                    if not due:
+                        self._take_stock()  # before the last picture: more arrives while it is drawn
                     recording.moments.append(await self._look(backend, cut, camera, now - self.start))
+                    if not due:
+                        return recording
                 recording.longest_frame_s = max(recording.longest_frame_s, clock() - now)
                 # A frame lands exactly on the next moment to look at, so that the report's times are the asked ones.
                 next_frame = min([next_frame + options.frame_interval, *due[:1]])
@@ -223,8 +243,6 @@ class _Session:
                 await asyncio.sleep(0)
                 while (early := next_frame - clock()) > 0:  # noqa: ASYNC110 - a timer may fire a clock tick too soon
                     await asyncio.sleep(early)
-            recording.stats = self.layer.stats
-            return recording
         finally:
             await loop.run_in_executor(self.drawer, backend.close)
 
@@ -248,6 +266,12 @@ class _Session:
             if recording.settled_s is None and not len(cut.wants):
                 recording.settled_s = t
         return cut, camera
+
+    def _take_stock(self) -> None:
+        """Note what the whole run brought."""
+        layer, recording = self.layer, self.recording
+        recording.stats, recording.header = layer.stats, layer.header
+        recording.samples = int(layer.index.samples[layer.resident].sum())
 
     async def _look(self, backend: Backend, cut: Cut, camera: Camera, t: float) -> Moment:
         """Draw a cut and note the state that it was drawn from."""
