@@ -2,7 +2,7 @@
 
 Samples with a spacing of r (one per area r^2, placed at random) leave the share `exp(-area / r^2)` of the surface
 uncovered by splats of that area. LPC 4 draws squares of side r: 37% holes, hidden there by a projection that is
-larger than need be. Splats here have an area of `CLOSING^2 r^2`: 0.5%, in gaps narrower than a splat, which are
+larger than need be. Splats here have an area of `CLOSING^2 r^2`: 0.5%, in gaps hardly wider than a splat, which are
 closed in the picture (`HOLE`). What remains is 0.02% of a closed surface, and silhouettes grow by a third of the
 spacing.
 
@@ -38,7 +38,7 @@ where the perspective stretches it at the rim of the picture."""
 
 HOLE = 1.0
 """Widest half of a gap that is taken for a hole of the sampling, sides of the splats around it. Random samples leave
-one gap or other at any density, and no scan is evenly dense; a gap narrower than a splat is no detail of the model."""
+one gap or other at any density, and no scan is evenly dense; what fits into such a gap is no detail of the model."""
 
 LARGEST_HOLE = 64
 """And in pixels."""
