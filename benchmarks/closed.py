@@ -17,9 +17,7 @@ from pointview.render.cpu import CpuBackend
 
 def main() -> None:
     camera = Camera(eye=(1, -2.5, 2), target=(0, 0, 0), up=(0, 0, 1), width=400, height=400)
-    print(
-        f"{'model':8} {'splats':12} {'tolerance':>9} {'clouds':>7} {'starved':>7} {'px':>5} {'holes %':>8} {'growth':>7}"
-    )
+    print(f"{'model':8} {'splats':12} {'tolerance':>9} {'clouds':>7} {'starved':>7} {'px':>5} {'holes %':>8}  growth")
     for name, model, distance in (
         ("sphere", models.sphere(200_000, cloud_size=1024), traced.sphere_distance),
         ("torus", models.torus(200_000, cloud_size=1024), traced.torus_distance),
