@@ -140,7 +140,7 @@ def partition(
     _order(group, ends - counts, order)
     del owner, group, priority
     out = np.empty_like(rows)
-    np.take(as_words(rows), order, axis=0, out=as_words(out))
+    np.take(as_words(rows), order, axis=0, out=as_words(out), mode="clip")  # "raise" would copy once more
     clouds = _clouds(out, ends - counts, counts, normals)
     regions.write(first_row, out)
     clouds.first[:] += first_row
@@ -176,7 +176,7 @@ def sort_by_path(rows: NDArray[Any], cells: Cells, bucket: Bucket) -> tuple[NDAr
         rest = cells.fixed(rows["xyz"])
         _sort_ties(packed, order, rest, cells.axes, cells.shifts, bucket.depth + window.bits)
     out = np.empty_like(rows)
-    np.take(as_words(rows), order, axis=0, out=as_words(out))
+    np.take(as_words(rows), order, axis=0, out=as_words(out), mode="clip")  # "raise" would copy once more
     return out, packed
 
 

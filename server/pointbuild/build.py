@@ -14,7 +14,7 @@ the bytes.
 
 from __future__ import annotations
 
-from contextlib import ExitStack, closing
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -33,7 +33,6 @@ from .inputs import Inputs, Source, open_inputs
 from .options import BuildOptions
 from .progress import Progress, Silent
 from .publish import publish
-from .rows import row_dtype
 from .scatter import Regions
 from .spool import Spool
 from .survey import columns_of, survey
@@ -129,17 +128,19 @@ def _warm(scratch: Path) -> None:
 def _build(inputs: Inputs, out: Path, scratch: Path, options: BuildOptions, progress: Progress) -> Header:
     columns = columns_of(inputs.attributes)
     spool_bytes = sum(column.itemsize for column in columns)
-    row_bytes = spool_bytes + 16  # a priority and padding; codes are never wider than values
+    row_bytes = -(-(spool_bytes + 8) // 8) * 8  # with a priority, in whole words; codes are never wider than values
     samples = inputs.samples_at_most
     disk.check_space(samples, scratch, out, spool_bytes, row_bytes)
     sizes = memory.choose_sizes(options, samples, row_bytes, memory.resident_bytes())
-    with ExitStack() as stack:
-        crew = stack.enter_context(Crew(sizes.threads))
-        spool_path = scratch / "spool"
-        spool = stack.enter_context(closing(Spool(spool_path, columns)))
+    spool_path = scratch / "spool"
+    # The crew comes last and goes first: no thread may hold a file that is closed.
+    with (
+        closing(Spool(spool_path, columns)) as spool,
+        closing(Regions(scratch / "rows")) as regions,
+        Crew(sizes.threads) as crew,
+    ):
         progress.stage("read", inputs.samples_hint)
         found = survey(inputs.batches(sizes.block), spool, crew, progress)
-        regions = stack.enter_context(closing(Regions(scratch / "rows", row_dtype(found.schema))))
         division = divide(
             spool,
             Cells.over(found.low, found.high),
@@ -153,4 +154,14 @@ def _build(inputs: Inputs, out: Path, scratch: Path, options: BuildOptions, prog
         )
         spool.close()
         spool_path.unlink()  # its room is the model's
-        return publish(division, found, inputs, regions, scratch / "clouds", out, options, crew, progress)
+        return publish(
+            division,
+            found,
+            inputs,
+            regions,
+            options,
+            clouds_path=scratch / "clouds",
+            out=out,
+            crew=crew,
+            progress=progress,
+        )

@@ -11,6 +11,7 @@ from .areas import Probing
 from .assemble import Nodes, assemble
 from .bucket import BucketTree, normal_table, partition
 from .plan import Plan, make_plan
+from .rows import row_dtype
 from .scatter import Candidates, Regions, scatter
 from .spacing import model_spacing
 from .survey import NORMAL_BITS
@@ -51,29 +52,49 @@ def divide(
     progress: Progress,
     slack: float = SLACK,
 ) -> Division:
-    """Distribute the spooled samples over nodes; `regions` then holds their rows."""
+    """Distribute the spooled samples over nodes.
+
+    Parameters
+    ----------
+    spool, cells
+        The samples, and how their box is divided.
+    regions : Regions
+        Gets the rows, in the end sorted by node.
+    schema : Schema
+        The attributes that rows carry.
+    cloud_size, seed : int
+        M, and what the priorities hash.
+    bucket_samples : int
+        Samples sorted in memory at a time; more where a region of `areas` asks for it.
+    crew, progress
+        Threads, and who is told.
+    slack : float
+        See `SLACK`.
+    """
     probing = Probing.of(spool.samples, cloud_size)
     most = max(bucket_samples, probing.region)
-    progress.stage("count", spool.samples if spool.samples > most else 0)
-
-    def positions(number: int) -> NDArray[np.float64]:
-        return spool.read(spool.blocks[number], ("xyz",))["xyz"]
-
-    plan = make_plan(cells, spool.samples, most, positions, len(spool.blocks), crew, progress)
+    plan = _count(spool, cells, most, crew, progress)
     upper = None
     while upper is None:
-        progress.stage("scatter", spool.samples)
         limits = candidate_limits(plan, cloud_size, slack)
-        upper = thresholds(
-            plan, _scatter(spool, cells, plan, limits, seed, schema, regions, crew, progress), limits, cloud_size
-        )
+        candidates = _scatter(spool, cells, plan, limits, seed, schema, regions, crew, progress)
+        upper = thresholds(plan, candidates, limits, cloud_size)
         slack *= 4
-    progress.stage("partition", spool.samples)
     trees = _partition(plan, upper, cells, probing, cloud_size, schema, regions, crew, progress)
     spacing = model_spacing(
         np.concatenate([tree.spacing for tree in trees]), np.concatenate([tree.weight for tree in trees])
     )
     return Division(assemble(plan, upper, trees), spacing)
+
+
+def _count(spool: Spool, cells: Cells, most: int, crew: Crew, progress: Progress) -> Plan:
+    if spool.samples > most:
+        progress.stage("count", spool.samples)
+
+    def positions(number: int) -> NDArray[np.float64]:
+        return spool.read(spool.blocks[number], ("xyz",))["xyz"]
+
+    return make_plan(cells, spool.samples, most, positions, len(spool.blocks), crew, progress)
 
 
 def _scatter(
@@ -87,7 +108,8 @@ def _scatter(
     crew: Crew,
     progress: Progress,
 ) -> Candidates:
-    regions.lay_out([bucket.count for bucket in plan.buckets])
+    progress.stage("scatter", spool.samples)
+    regions.lay_out(row_dtype(schema), [bucket.count for bucket in plan.buckets])
 
     def one(number: int) -> Candidates:
         return scatter(spool.blocks[number], spool, cells, plan, limits, seed, schema, regions)
@@ -112,6 +134,7 @@ def _partition(
     crew: Crew,
     progress: Progress,
 ) -> list[BucketTree]:
+    progress.stage("partition", int(regions.first[-1]))
     has_normals = any(attribute.name == "normal" for attribute in schema)
     table = normal_table(NORMAL_BITS) if has_normals else None
 

@@ -77,14 +77,20 @@ def bucket_bytes(row_bytes: int) -> int:
 
 def resident_bytes() -> int:
     """Resident size of this process now; its peak where the system does not say."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-    except OSError:
-        return peak_bytes()
-    return pages * resource.getpagesize()
+    return _status("VmRSS") or peak_bytes()
 
 
 def peak_bytes() -> int:
     """Peak resident size of this process."""
+    # Linux lets a process inherit the ru_maxrss of whoever started it; VmHWM is its own.
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
+    return _status("VmHWM") or (peak if sys.platform == "darwin" else peak * 1024)
+
+
+def _status(field: str) -> int:
+    """Read a field of /proc/self/status in bytes; 0 where there is none."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+    except OSError:
+        return 0
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{field}:")), 0)

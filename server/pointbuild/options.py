@@ -79,4 +79,8 @@ class BuildOptions:
     @property
     def workers(self) -> int:
         """Worker threads to start."""
-        return self.threads or len(os.sched_getaffinity(0))
+        if self.threads:
+            return self.threads
+        if hasattr(os, "sched_getaffinity"):
+            return len(os.sched_getaffinity(0))
+        return os.cpu_count() or 1

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
@@ -34,9 +33,12 @@ if TYPE_CHECKING:
     from .work import Crew
 
 GENERATOR = "pointstream 0.1"
+
 RUN_SAMPLES = 1 << 15
 """Encoded at a time by one thread."""
+
 COSTED_CLOUDS = 256
+"""Clouds, evenly over the tree, that say what each kind of number costs."""
 
 
 def publish(
@@ -44,67 +46,72 @@ def publish(
     found: Survey,
     inputs: Inputs,
     regions: Regions,
+    options: BuildOptions,
+    *,
     clouds_path: Path,
     out: Path,
-    options: BuildOptions,
     crew: Crew,
     progress: Progress,
 ) -> Header:
-    """Write the model and give its header."""
+    """Write the model and give its header.
+
+    Parameters
+    ----------
+    division, found, inputs
+        The tree, what the survey found, and what is known of the scans.
+    regions : Regions
+        Rows sorted by node.
+    options : BuildOptions
+    clouds_path, out : Path
+        Of a temporary file for the clouds, and of the model.
+    crew, progress
+        Threads, and who is told.
+
+    Raises
+    ------
+    BuildError
+        If no lattice can hold the samples within the wanted error.
+    """
     nodes = division.nodes
     extent = float((found.high - found.low).max())
     step = choose_step(division.spacing, extent, options.position_error)
     geometry = Geometry.of(nodes, found.low, found.high, step)
     spacing, ratio = node_spacings(nodes, division.spacing, step)
-    records = Records(nodes, geometry, spacing)
-    progress.stage("encode", int(nodes.samples.sum()))
+    progress.stage("encode", int(nodes.subtree[0]))
     with clouds_path.open("w+b") as clouds:
-        costs = dict.fromkeys(KINDS, 0.0)
-        costed = set(np.linspace(0, len(nodes) - 1, COSTED_CLOUDS).astype(int).tolist())
-        encode = partial(
-            _encode, nodes=nodes, geometry=geometry, regions=regions, schema=found.schema, effort=options.effort,
-            table=normal_vectors(NORMAL_BITS) if any(entry.kind == "normal" for entry in found.schema) else None,
-        )  # fmt: skip
-        for (first, stop), run in crew.map(encode, runs(nodes, RUN_SAMPLES)):
-            clouds.writelines(run.frames)
-            records.add(run)
-            for node in costed.intersection(range(first, stop)):
-                for kind, size in cloud_costs(run.frames[node - first], int(nodes.samples[node]), found.schema).items():
-                    costs[kind] += size
-            progress.advance(int(nodes.samples[first:stop].sum()))
-        finished = records.finish()
+        records = Records(nodes, geometry, spacing)
+        costs = _encode(records, clouds, regions, found, options.effort, crew, progress)
         pages = -(-len(nodes) // options.page_nodes)
-        index_bytes = PAGE_HEADER * pages + RECORD.itemsize * len(nodes)
-        samples = int(nodes.subtree[0])
-        header = seal(
-            Header(
-                bytes=2**53,
-                samples=samples,
-                nodes=len(nodes),
-                levels=int(nodes.depth.max()) + 1,
-                cloud_size=options.cloud_size,
-                page_nodes=options.page_nodes,
-                origin=_triple(found.low),
-                step=step,
-                side=geometry.side,
-                bounds=(*_triple(found.low), *_triple(found.high)),
-                spacing=division.spacing,
-                position_error=position_error_bound(step, found.low, extent),
-                attributes=found.schema,
-                constants=found.constants,
-                crs=inputs.crs,
-                left_out={**inputs.left_out, **found.left_out},
-                rejected=found.rejected,
-                bits_per_sample=bits_per_sample(costs, clouds.tell(), index_bytes, samples),
-                spacing_ratio=ratio,
-                seed=options.seed,
-                generator=GENERATOR,
+        header = Header(
+            bytes=2**53,
+            samples=int(nodes.subtree[0]),
+            nodes=len(nodes),
+            levels=int(nodes.depth.max()) + 1,
+            cloud_size=options.cloud_size,
+            page_nodes=options.page_nodes,
+            origin=_triple(found.low),
+            step=step,
+            side=geometry.side,
+            bounds=(*_triple(found.low), *_triple(found.high)),
+            spacing=division.spacing,
+            position_error=position_error_bound(step, found.low, extent),
+            attributes=found.schema,
+            constants=found.constants,
+            crs=inputs.crs,
+            left_out={**inputs.left_out, **found.left_out},
+            rejected=found.rejected,
+            bits_per_sample=bits_per_sample(
+                costs, clouds.tell(), PAGE_HEADER * pages + RECORD.itemsize * len(nodes), int(nodes.subtree[0])
             ),
-            finished,
+            spacing_ratio=ratio,
+            seed=options.seed,
+            generator=GENERATOR,
         )
-        progress.stage("write", samples)
+        finished = records.finish()
+        header = seal(header, finished)
+        progress.stage("write", header.samples)
         write_model(out, header, finished, clouds)
-        progress.advance(samples)
+    progress.advance(header.samples)
     return header
 
 
@@ -125,24 +132,42 @@ def choose_step(spacing: float, extent: float, position_error: float | None) -> 
     return step
 
 
+def _encode(
+    records: Records,
+    clouds: BinaryIO,
+    regions: Regions,
+    found: Survey,
+    effort: Effort,
+    crew: Crew,
+    progress: Progress,
+) -> dict[str, float]:
+    """Write all clouds in order and fill the records; what the kinds of numbers cost in some of the clouds."""
+    nodes, geometry = records.nodes, records.geometry
+    has_normals = any(attribute.kind == "normal" for attribute in found.schema)
+    table = normal_vectors(NORMAL_BITS) if has_normals else None
+
+    def one(run: tuple[int, int]) -> Run:
+        return encode_run(
+            *run, nodes=nodes, geometry=geometry, regions=regions, schema=found.schema, effort=effort, table=table
+        )
+
+    costs = dict.fromkeys(KINDS, 0.0)
+    costed = set(np.linspace(0, len(nodes) - 1, COSTED_CLOUDS).astype(int).tolist())
+    for (first, stop), run in crew.map(one, runs(nodes, RUN_SAMPLES)):
+        clouds.writelines(run.frames)
+        records.add(run)
+        for node in costed.intersection(range(first, stop)):
+            for kind, size in cloud_costs(run.frames[node - first], int(nodes.samples[node]), found.schema).items():
+                costs[kind] += size
+        progress.advance(int(nodes.samples[first:stop].sum()))
+    return costs
+
+
 def runs(nodes: Nodes, samples: int) -> list[tuple[int, int]]:
     """Cut the nodes into runs of about so many samples."""
     run = np.cumsum(nodes.samples) // samples
     starts = np.flatnonzero(np.diff(run, prepend=-1)).tolist()
     return list(zip(starts, [*starts[1:], len(nodes)], strict=True))
-
-
-def _encode(
-    run: tuple[int, int],
-    *,
-    nodes: Nodes,
-    geometry: Geometry,
-    regions: Regions,
-    schema: Any,
-    effort: Effort,
-    table: NDArray[np.float32] | None,
-) -> Run:
-    return encode_run(*run, nodes=nodes, geometry=geometry, regions=regions, schema=schema, effort=effort, table=table)
 
 
 def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:

@@ -43,19 +43,18 @@ class Regions:
     ----------
     path : Path
         Is created; removing it is the owner's part.
-    dtype : dtype
-        Of the rows.
     """
 
-    def __init__(self, path: Path, dtype: np.dtype[Any]) -> None:
-        self.dtype = dtype
+    def __init__(self, path: Path) -> None:
+        self.dtype: np.dtype[Any] = np.dtype([])
         self.first = np.zeros(1, np.int64)
         self._filled = np.zeros(0, np.int64)
         self._lock = threading.Lock()
         self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
 
-    def lay_out(self, counts: list[int]) -> None:
-        """Say how many rows each bucket will have; what was appended is forgotten."""
+    def lay_out(self, dtype: np.dtype[Any], counts: list[int]) -> None:
+        """Say what rows are and how many each bucket will have; what was appended is forgotten."""
+        self.dtype = dtype
         self.first = np.concatenate([[0], np.cumsum(counts)])
         self._filled = np.zeros(len(counts), np.int64)
 

@@ -222,7 +222,7 @@ def test_plain_lines_where_there_is_no_terminal(scan_path: Callable[[str], Path]
     result = CliRunner().invoke(build, arguments)
     assert result.exit_code == 0
     assert [line.split(":")[0] for line in result.stderr.splitlines()] == [
-        "read", "count", "scatter", "partition", "encode", "write",
+        "read", "scatter", "partition", "encode", "write",
     ]  # fmt: skip
     assert "453 samples" in result.stdout
 
