@@ -96,8 +96,8 @@ def write_report(folder: Path, report: Report, moments: Sequence[Moment]) -> lis
         folder.mkdir(parents=True, exist_ok=True)
         written = [folder / "report.json"]
         written[0].write_text(json.dumps(asdict(report), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        for moment in _pictured(moments, report.seconds):
-            stem, picture = f"frame-{moment.t:06.1f}s", moment.picture()
+        for stem, moment in _pictured(moments, report.seconds).items():
+            picture = moment.picture()
             for path, rgb in (
                 (folder / f"{stem}.png", picture.rgb),
                 (folder / f"{stem}-starved.png", tint_starved(picture)),
@@ -111,15 +111,15 @@ def write_report(folder: Path, report: Report, moments: Sequence[Moment]) -> lis
     return written
 
 
-def _pictured(moments: Sequence[Moment], seconds: float) -> list[Moment]:
-    """Return the moments at the picture times that the run reached, and its last one."""
-    if not moments:
-        return []
-    chosen: dict[str, Moment] = {}
-    for wanted in (*(t for t in PICTURE_TIMES if t <= seconds), moments[-1].t):
-        nearest = min(moments, key=lambda moment: abs(moment.t - wanted))
-        chosen[f"{nearest.t:.1f}"] = nearest
-    return list(chosen.values())
+def _pictured(moments: Sequence[Moment], seconds: float) -> dict[str, Moment]:
+    """Return the moments nearest to the picture times within the run and to its end, by the names of their files.
+
+    A real clock may be some milliseconds late; the names are those of the asked times.
+    """
+    return {
+        f"frame-{wanted:06.1f}s": min(moments, key=lambda moment: abs(moment.t - wanted))
+        for wanted in (*(t for t in PICTURE_TIMES if t <= seconds), seconds)
+    }
 
 
 def plot_curve(path: Path, report: Report) -> None:

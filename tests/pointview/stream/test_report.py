@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from support.streaming import stream
 
 from lpc.errors import StoreError
 from pointview.render.picture import TINT, YELLOW
-from pointview.stream.report import prepare_folder
+from pointview.stream.report import _pictured, prepare_folder
 
 CONTRACT = [
     "link", "clock", "samples", "bytes", "requests", "link_utilisation", "first_picture_s", "settled_s", "tolerance",
@@ -83,6 +84,12 @@ def test_the_plot_can_be_opened(folder):
 def test_only_times_within_the_run_have_pictures(small, tmp_path):
     stream(small, tmp_path, "--seconds", 0.7)
     assert {path.name for path in tmp_path.glob("frame*.png")} == {"frame-0000.7s.png", "frame-0000.7s-starved.png"}
+
+
+def test_pictures_are_named_by_the_asked_times_though_a_real_clock_is_late():
+    late = [SimpleNamespace(t=t) for t in (0.106, 0.96, 1.07, 9.52, 10.08, 12.31)]
+    chosen = {name: moment.t for name, moment in _pictured(late, 12.0).items()}
+    assert chosen == {"frame-0001.0s": 0.96, "frame-0010.0s": 10.08, "frame-0012.0s": 12.31}
 
 
 def test_a_run_without_any_picture_still_has_a_report(small, tmp_path):
