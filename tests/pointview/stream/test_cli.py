@@ -7,12 +7,13 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
-from support.servers import REPOSITORY
 
 from pointstream.command import run as command
 
+REPOSITORY = Path(__file__).resolve().parents[3]
 ROOMS = os.pathsep.join(str(REPOSITORY / room) for room in ("common", "server", "client"))
 ENVIRONMENT = {**os.environ, "PYTHONPATH": ROOMS}
 

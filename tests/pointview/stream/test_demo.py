@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,13 +16,13 @@ from lpc.errors import LpcError
 from pointview.stream import demo
 from pointview.stream.cli import demo as command
 
+REPOSITORY = Path(__file__).resolve().parents[3]
+
 
 @pytest.fixture
 def rooms(monkeypatch):
     """Sub-commands find the packages of this checkout, installed or not."""
-    from support.servers import REPOSITORY
-
-    monkeypatch.setenv("PYTHONPATH", ":".join(str(REPOSITORY / room) for room in ("common", "server", "client")))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(str(REPOSITORY / room) for room in ("common", "server", "client")))
 
 
 def test_build_serve_stream_and_five_figures(tmp_path, rooms):
