@@ -21,9 +21,13 @@ if TYPE_CHECKING:
     from .rate import RateCap
 
 SMALL = 256 * 1024
-"""Bodies up to here are read and sent in one piece; larger ones go piece by piece through sendfile."""
+"""Bodies up to here are read and sent in one piece; larger ones go piece by piece."""
 
-PIECE = 512 * 1024
+LARGE = 4 * 1024 * 1024
+"""Parts from here on go through sendfile: it spares copies, but each call waits for the socket to drain, which below
+this size costs more than the copies do (benchmarks/serve.py)."""
+
+PIECE = 1024 * 1024
 """What one call of sendfile is given, so that a stalled reader is noticed between two."""
 
 Fields = tuple[tuple[str, str], ...]
@@ -140,7 +144,7 @@ async def _send_part(
 ) -> None:
     loop = asyncio.get_running_loop()
     transport = request.transport
-    by_kernel = transport is not None and _has_sendfile(loop, transport)
+    by_kernel = part.stop - part.start >= LARGE and transport is not None and _has_sendfile(loop, transport)
     piece = PIECE if by_kernel else SMALL
     if pace.cap is not None:
         piece = min(piece, pace.cap.piece)
