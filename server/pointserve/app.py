@@ -104,7 +104,7 @@ async def _model(request: web.Request) -> web.StreamResponse:
     service = request.app[SERVICE]
     names = model_names(request.rel_url.raw_path)
     if names is None:
-        raise NotFound("there is nothing of that name here")
+        raise NotFound(request.rel_url.raw_path)
     headers = request.headers
 
     def field(name: str) -> str | None:
@@ -141,7 +141,7 @@ async def _listed(request: web.Request) -> tuple[Entry, ...]:
     below = () if place is None else place.names
     found = tuple(entry for entry in entries if entry.names[: len(below)] == below and entry.names != below)
     if not found and (place is None or below):
-        raise NotFound("there is nothing of that name here")
+        raise NotFound(request.rel_url.raw_path)
     return found
 
 
@@ -201,8 +201,8 @@ async def _errors(request: web.Request, handler: Handler) -> web.StreamResponse:
         # The reader has gone, or the server stops: aiohttp writes no line for a reply that did not end.
         service.ledger.note(request, 499, request.get(SENT_BYTES, 0), service.clock() - began, cut=True)
         raise
-    except NotFound as error:
-        return _line(404, str(error))
+    except NotFound:
+        return _line(404, "there is nothing of that name here")  # the same words for what is hidden and what is absent
     except StoreError as error:
         return _line(503, str(error), {"Retry-After": "5"})
     except web.HTTPException as error:
