@@ -114,7 +114,7 @@ class AccessLayer:
             wanted_seconds=self._traffic.wanted.seconds(now),
             decode_seconds=self._traffic.decoder.seconds,
             build=self._traffic.builds,
-            errors=self._traffic.errors.reports,
+            errors=self._traffic.reports,
         )
 
     def take(self, node: int) -> Cloud:
@@ -143,15 +143,7 @@ class AccessLayer:
             return
         pages, nodes = build.missing(np.asarray(wants, dtype=np.int64))
         self._traffic.wanted.frame(self._clock(), pages, nodes)
-        nodes = nodes[~build.busy[nodes]]
-        places = np.array([build.page_item(page) for page in pages.tolist()], dtype=np.int64).reshape(-1, 3)
-        start = build.index.offset[nodes]
-        self._traffic.scheduler.offer(
-            np.concatenate([places[:, 0], nodes]),
-            np.concatenate([places[:, 1], start]),
-            np.concatenate([places[:, 2], start + build.index.size[nodes]]),
-        )
-        self._traffic.issue()
+        self._traffic.offer(build, pages, nodes[~build.busy[nodes]])
 
     async def idle(self) -> None:
         """Wait until nothing is in flight and nothing is being decoded."""

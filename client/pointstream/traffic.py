@@ -18,10 +18,10 @@ from lpc.ranges import ByteRange
 from .arrivals import Assembly
 from .build import Build
 from .decoding import Decoder
-from .opening import Opening, add_page
+from .opening import Opening, add_page, vouch_opening
 from .recovery import Recovery
 from .scheduler import Item, LinkState, Request, Scheduler
-from .stats import ErrorLog
+from .stats import ErrorLog, ErrorReport
 from .wanted import Wanted
 
 if TYPE_CHECKING:
@@ -44,8 +44,8 @@ class Traffic:
         The present one; None until the first page is here. Replaced in one step when the host changes the model.
     builds : int
         How many there were.
-    scheduler : Scheduler
-        Replaced together with the build.
+    scheduler, local : Scheduler
+        Of what comes over the link, and of what the store holds. Replaced together with the build.
     decoder : Decoder
     wanted : Wanted
     errors : ErrorLog
@@ -59,7 +59,7 @@ class Traffic:
         self.store = store
         self.build: Build | None = None
         self.builds = 0
-        self.scheduler = Scheduler(options.scheduler)
+        self.scheduler, self.local = Scheduler(options.scheduler), Scheduler(options.scheduler)
         self.decoder = Decoder(options.decode_threads, clock)
         self.wanted = Wanted(clock())
         self.errors = ErrorLog()
@@ -97,23 +97,52 @@ class Traffic:
         self.decoder.close()
         await self.store.close()
 
+    @property
+    def reports(self) -> tuple[ErrorReport, ...]:
+        """What went wrong, once per cause, and what the store has to do without."""
+        warnings = (ErrorReport(cause="store", text=text) for text in self.store.warnings)
+        return (*self.errors.reports, *warnings)
+
+    def offer(self, build: Build, pages: NDArray[np.int64], nodes: NDArray[np.int64]) -> None:
+        """Replace what is wanted, and ask for what may be asked for now; what the store holds waits for no link.
+
+        Parameters
+        ----------
+        build : Build
+        pages, nodes : (n,) int64
+            Pages before nodes, each most urgent first.
+        """
+        places = np.array([build.page_item(page) for page in pages.tolist()], dtype=np.int64).reshape(-1, 3)
+        start = build.index.offset[nodes]
+        keys = np.concatenate([places[:, 0], nodes])
+        starts = np.concatenate([places[:, 1], start])
+        stops = np.concatenate([places[:, 2], start + build.index.size[nodes]])
+        held = np.concatenate([self.store.holds(places[:, 1], places[:, 2]), build.held[nodes]])
+        self.local.offer(keys[held], starts[held], stops[held])
+        self.scheduler.offer(keys[~held], starts[~held], stops[~held])
+        self.issue()
+
     def issue(self) -> None:
         """Ask for what may be asked for now."""
         now = self._clock()
         build = self.build
-        if build is None or self.stopped or self._recovery.paused(now):
+        if build is None or self.stopped:
             return
         if self._stale:
-            if not self._probing:
+            if not self._probing and not self._recovery.paused(now):
                 self._probing = True
                 self._spawn(self._probe())
             return
         if self.decoder.backlog > self._options.decode_backlog or build.residency.full:
             return
+        for request in self.local.issue(now, None):
+            self._spawn(self._fetch(build, request, self.local))
+        if self._recovery.paused(now):
+            return
         meter = self.store.meter
         link = None if meter is None else LinkState(meter.admission(now), meter.rtt, meter.measured)
         for request in self.scheduler.issue(now, link):
-            self._spawn(self._fetch(build, request))
+            self._spawn(self._fetch(build, request, self.scheduler))
 
     def _spawn(self, work: Coroutine[None, None, None]) -> None:
         task = asyncio.get_running_loop().create_task(work)
@@ -139,7 +168,7 @@ class Traffic:
         def look(*, ended: bool = False) -> None:
             nonlocal build
             if build is None and opening.look(assembly.data, ended=ended):
-                build = self._begin(opening)
+                build = self._begin(opening, assembly.data)
                 self._claim(build, request, assembly, np.flatnonzero(build.index.known))
                 if opened is not None:
                     opened.set_result(None)
@@ -151,8 +180,9 @@ class Traffic:
             look()
 
         try:
+            request.range = ByteRange(0, await self.store.opening_bytes())
             data = await self.store.read(request.range, sink)
-            look(ended=len(data) < HEADER_PROBE)
+            look(ended=len(data) < request.range.size)
             while build is None:  # the header is larger than the probe
                 await self.store.read(ByteRange(len(assembly.data), opening.needed), sink)
                 look(ended=len(assembly.data) < opening.needed)
@@ -167,7 +197,7 @@ class Traffic:
             scheduler.ended(request)
         self.issue()
 
-    def _begin(self, opening: Opening) -> Build:
+    def _begin(self, opening: Opening, data: bytearray) -> Build:
         """Take what was just opened for the model, in one step, if it is another build than the one at hand."""
         assert opening.index is not None
         header = opening.index.header
@@ -176,9 +206,9 @@ class Traffic:
         if self.build is not None and self.build.index.header.digest == header.digest:
             self.store.forget(distrust_tags=True)  # the tag changed and the model did not
             return self.build
-        length = header.bytes if self.store.length is None else min(header.bytes, self.store.length)
+        vouch_opening(self.store, opening, data)
         self.builds += 1
-        self.build = Build(opening.index, capacity=self._options.capacity, length=length)
+        self.build = Build(opening.index, capacity=self._options.capacity, store=self.store)
         self.wanted.begin(header.nodes)
         return self.build
 
@@ -188,8 +218,8 @@ class Traffic:
         self.scheduler.claim(request, tuple(items))
         assembly.expect(items)
 
-    async def _fetch(self, build: Build, request: Request) -> None:
-        scheduler, assembly = self.scheduler, Assembly(request.range.start, request.items)
+    async def _fetch(self, build: Build, request: Request, scheduler: Scheduler) -> None:
+        assembly = Assembly(request.range.start, request.items)
 
         def sink(offset: int, chunk: bytes) -> None:
             self._land(scheduler, request, assembly, offset, chunk)
@@ -223,7 +253,7 @@ class Traffic:
                 self._page_arrived(build, ~item.key, data, request, assembly)
             elif not build.residency.resident[item.key] and not build.busy[item.key]:
                 build.busy[item.key] = True
-                done = partial(self._decoded, build, item)
+                done = partial(self._decoded, build, item, data)
                 self.decoder.decode(data, node=item.key, index=build.index, done=done)
         if arrived:
             self.issue()
@@ -237,15 +267,15 @@ class Traffic:
         except FormatError as error:
             self._damaged(build, ~page, error)
             return
-        self.payload += len(data)
-        build.page_came()
+        self.payload += len(data) * build.passed(build.page_item(page), data)
+        build.page_came(page)
         self.wanted.came(self._clock(), ~page)
         if request.range.start == 0:  # the probe: what else the new page shows to lie inside it
             first = page * build.index.header.page_nodes
             nodes = np.arange(first, min(first + build.index.header.page_nodes, len(build.index)))
             self._claim(build, request, assembly, nodes)
 
-    def _decoded(self, build: Build, item: Item, cloud: Cloud | Corrupt) -> None:
+    def _decoded(self, build: Build, item: Item, data: bytes, cloud: Cloud | Corrupt) -> None:
         build.busy[item.key] = False
         self._settle()
         if build is not self.build:
@@ -253,7 +283,7 @@ class Traffic:
         if isinstance(cloud, Corrupt):
             self._damaged(build, item.key, cloud)
         else:
-            self.payload += item.stop - item.start
+            self.payload += len(data) * build.passed(item, data)
             build.add(item.key, cloud)
             self.wanted.came(self._clock(), item.key)
         self.issue()
@@ -284,7 +314,7 @@ class Traffic:
             return
         for task in self._tasks - {asyncio.current_task()}:
             task.cancel()
-        self.scheduler = Scheduler(self._options.scheduler)
+        self.scheduler, self.local = Scheduler(self._options.scheduler), Scheduler(self._options.scheduler)
         self._stale = True
         self.store.forget()
         self.issue()

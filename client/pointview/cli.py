@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 import click
 
 from lpc.errors import FormatError
+from pointstream.cli import CACHE, choose_cache
 
 if TYPE_CHECKING:
     from .refine import Cut
@@ -88,6 +89,7 @@ def positive(_ctx: click.Context, _param: click.Parameter, value: float) -> floa
 @click.option("--budget", type=click.IntRange(min=1), help="Most splats; coarser where the tolerance needs more.")
 @click.option("--backend", type=click.Choice(["auto", "gl", "cpu"]), default="auto", show_default=True)
 @click.option("--two-sided", is_flag=True, help="Show surfaces from behind too: for normals that may point inward.")
+@CACHE
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def render(
     model: str,
@@ -98,6 +100,7 @@ def render(
     budget: int | None,
     backend: Any,
     two_sided: bool,
+    cache: str | None,
     as_json: bool,
 ) -> None:
     """Draw MODEL, a path or address of a .lpc file, into OUT.png."""
@@ -117,7 +120,7 @@ def render(
         style=Style(two_sided=two_sided),
     )
     with Waiting() as waiting:
-        still = asyncio.run(draw_still(model, options, progress=waiting.show))
+        still = asyncio.run(draw_still(model, options, cache=choose_cache(cache, model), progress=waiting.show))
     save_png(still.frame.rgb, out)
     for problem in still.problems:
         click.echo(f"pointstream: {problem}", err=True)

@@ -19,6 +19,8 @@ from .settle import settle
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from pointstream.cache import Cache
+
 CAPACITY = 4 << 30
 """Bytes of decoded clouds: a still picture holds its whole cut, however fine."""
 
@@ -76,8 +78,14 @@ class Still:
     problems: tuple[str, ...]
 
 
-async def draw_still(target: str, options: StillOptions, *, progress: Callable[[Cut], None] | None = None) -> Still:
-    """Draw one picture of the model at a path or address.
+async def draw_still(
+    target: str,
+    options: StillOptions,
+    *,
+    cache: Cache | None = None,
+    progress: Callable[[Cut], None] | None = None,
+) -> Still:
+    """Draw one picture of the model at a path or address; `cache` keeps what comes from an address.
 
     Raises
     ------
@@ -86,7 +94,7 @@ async def draw_still(target: str, options: StillOptions, *, progress: Callable[[
     """
     if options.view is not None:  # a wrong view costs no connection
         Camera.from_view(options.view, width=options.width, height=options.height)
-    store = open_store(target, clock=time.monotonic)
+    store = open_store(target, clock=time.monotonic, cache=cache)
     layer = await AccessLayer.open(store, options=LayerOptions(capacity=CAPACITY), clock=time.monotonic)
     try:
         look = partial(_look, options=options)

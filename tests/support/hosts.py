@@ -13,7 +13,9 @@ from pointlink.memory import Network
 from pointlink.origin import Origin, serve_origin
 from pointlink.profiles import LAN, Profile
 from pointlink.resources import Resource
+from pointstream.cache import Cache
 from pointstream.stores import LocalStore, MemoryStore
+from pointstream.stores.cached import CachedStore
 from pointstream.stores.http import HttpOptions, HttpStore
 
 if TYPE_CHECKING:
@@ -69,7 +71,7 @@ async def socket_store(origin: Origin, options: HttpOptions | None = None) -> As
         server.close()
 
 
-KINDS = ("memory", "local", "virtual", "socket")
+KINDS = ("memory", "local", "virtual", "socket", "cached")
 
 
 def with_store(kind: str, data: bytes, folder: Path, check: Callable[[Store], Awaitable[None]]) -> None:
@@ -82,6 +84,13 @@ def with_store(kind: str, data: bytes, folder: Path, check: Callable[[Store], Aw
         elif kind == "socket":
             async with socket_store(origin_of(data)) as store:
                 await check(store)
+        elif kind == "cached":
+            async with virtual_store(origin_of(data)) as store:
+                cached = CachedStore(store, Cache(folder / "cache"))
+                try:
+                    await check(cached)
+                finally:
+                    await cached.close()
         else:
             path = folder / "file"
             path.write_bytes(data)
@@ -91,7 +100,7 @@ def with_store(kind: str, data: bytes, folder: Path, check: Callable[[Store], Aw
             finally:
                 await plain.close()
 
-    if kind == "virtual":
+    if kind in ("virtual", "cached"):
         virtual.run(run())
     else:
         asyncio.run(run())

@@ -21,6 +21,7 @@ from lpc.errors import StoreError
 from lpc.ranges import ByteRange
 from pointstream.goodput import Goodput, Transfer
 
+from .base import KeepsNothing
 from .lanes import Lane, Lanes, plain_transports
 from .patience import PatienceOptions, Tries, overdue
 from .replies import Beyond, Moved, Part, Pins, Retry, Whole, judge, ranges_unsupported
@@ -56,7 +57,7 @@ class HttpOptions:
     patience: PatienceOptions = field(default_factory=PatienceOptions)
 
 
-class HttpStore:
+class HttpStore(KeepsNothing):
     """A file at an http(s) address as a store.
 
     Parameters
@@ -147,6 +148,11 @@ class HttpStore:
         self._pins, self._whole, self.length = Pins(), None, None
         self._past_caches = True
         self._distrust_tags |= distrust_tags
+
+    def reject(self, place: ByteRange) -> None:
+        """Go past caches, and ask for a small file anew: one of them may have damaged it."""
+        del place
+        self._whole, self._past_caches = None, True
 
     async def close(self) -> None:
         """Close all connections."""
