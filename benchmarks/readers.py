@@ -15,8 +15,9 @@ import laspy
 import numpy as np
 import pye57
 from plyfile import PlyData, PlyElement
-from pointbuild.readers import finite, open_scan
 from pypcd4 import Encoding, PointCloud
+
+from pointbuild.readers import finite, open_scan
 
 
 def columns(count: int) -> dict[str, np.ndarray[Any, Any]]:

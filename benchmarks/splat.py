@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
 from functools import partial
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +21,9 @@ from pointview.refine import Culled, Cut
 from pointview.render import open_backend
 from pointview.render.backend import Style
 from pointview.splats import CLOSING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 SAMPLES = 4_000_000
 CLOUD = 8192

@@ -18,6 +18,12 @@ settings.load_profile("pointstream")
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
+@pytest.fixture(autouse=True)
+def _no_cache_of_the_user(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the commands keep of a model goes to a folder of the test."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
+
+
 @pytest.fixture
 def scan_path() -> Callable[[str], Path]:
     """Return a real scan by file name; the test is skipped only where the folder of scans is absent."""

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lpc.ranges import ByteRange
+
 from .residency import Residency
 from .scheduler import Item
 
@@ -17,6 +19,8 @@ if TYPE_CHECKING:
 
     from lpc.cloud import Cloud
     from lpc.index import IndexTree
+
+    from .stores import Store
 
 
 class Build:
@@ -27,8 +31,8 @@ class Build:
     index : IndexTree
     capacity : int
         Bytes of decoded clouds.
-    length : int
-        Bytes of the file; less than the header says if it was cut short.
+    store : Store
+        Says what of the file is there, and what it holds without asking over a link.
 
     Attributes
     ----------
@@ -38,29 +42,36 @@ class Build:
         Known nodes that cannot be had: cut off, or damaged at every try.
     busy : ndarray, (nodes,) bool
         Arrived and being decoded.
+    held : ndarray, (nodes,) bool
+        The store has them without asking over a link.
     """
 
-    def __init__(self, index: IndexTree, *, capacity: int, length: int) -> None:
-        self.index = index
+    def __init__(self, index: IndexTree, *, capacity: int, store: Store) -> None:
+        self.index, self._store = index, store
         self.residency = Residency(len(index), capacity)
         self.clouds: dict[int, Cloud] = {}
         self.absent: NDArray[np.bool_] = np.zeros(len(index), dtype=bool)
         self.busy: NDArray[np.bool_] = np.zeros(len(index), dtype=bool)
-        self.length = length
+        self.held: NDArray[np.bool_] = np.zeros(len(index), dtype=bool)
+        self.length = index.header.bytes if store.length is None else min(index.header.bytes, store.length)
         self.lost_pages: set[int] = set()
         self._failures: dict[int, int] = {}
-        self.page_came()
+        for page in np.flatnonzero(index.page_loaded).tolist():
+            self.page_came(page)
 
-    def page_came(self) -> None:
-        """Find out which of the known nodes are cut off."""
-        if self.length < self.index.header.bytes:
-            self.absent |= self.index.known & ~self.index.available(self.length)
+    def page_came(self, page: int) -> None:
+        """Find out which of a page's nodes the store holds, and which of them it can never give."""
+        first = page * self.index.header.page_nodes
+        rows = slice(first, first + self.index.header.page_nodes)
+        stops = self.index.offset[rows] + self.index.size[rows]
+        self.held[rows] = self._store.holds(self.index.offset[rows], stops)
+        self.absent[rows] = (stops > self.length) | (self._store.partial & ~self.held[rows])
 
     def ends_at(self, length: int) -> None:
         """Learn that the file is shorter than thought."""
         if length < self.length:
             self.length = length
-            self.page_came()
+            self.absent |= self.index.known & ~self.index.available(length)
 
     def add(self, node: int, cloud: Cloud) -> None:
         """Make a decoded cloud resident."""
@@ -74,6 +85,9 @@ class Build:
 
     def failed(self, key: int, tries: int) -> bool:
         """Count a damaged cloud or page; True if that was the last try and it stays missing."""
+        self._store.reject(self.index.page_range(~key) if key < 0 else self.index.cloud_range(key))
+        if key >= 0:
+            self.held[key] = False
         self._failures[key] = self._failures.get(key, 0) + 1
         if self._failures[key] < tries:
             return False
@@ -106,8 +120,20 @@ class Build:
         return Item(~page, place.start, place.stop)
 
     def has(self, item: Item) -> bool:
-        """Whether the file reaches to the end of an object."""
-        return item.stop <= self.length
+        """Whether the store can give an object."""
+        return item.stop <= self.length and (not self._store.partial or self.holds(item))
+
+    def holds(self, item: Item) -> bool:
+        """Whether the store can give an object without asking over a link."""
+        return bool(self._store.holds(np.array([item.start]), np.array([item.stop]))[0])
+
+    def passed(self, item: Item, data: bytes) -> bool:
+        """Note that a cloud's or page's bytes passed their checks; True if they were not held."""
+        before = self.holds(item) if item.key < 0 else bool(self.held[item.key])
+        kept = not before and self._store.vouch(ByteRange(item.start, item.stop), data)
+        if item.key >= 0:
+            self.held[item.key] |= kept
+        return not before
 
     def items_within(self, stop: int, nodes: NDArray[np.int64]) -> list[Item]:
         """Clouds of `nodes`, and pages not yet loaded, that end at or before `stop`."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
-import sys
 import time
+from contextlib import ExitStack
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,10 +14,11 @@ import click
 
 from lpc.errors import ScanError
 
+from .cache import Cache
 from .model import open_model
 from .progress import progress
-from .reading import Reader
-from .stores import open_store
+from .reading import Reader, Region
+from .stores import is_address, open_store
 from .verify import Scan, VerifyReport
 from .verify import verify as verify_reader
 
@@ -29,6 +30,22 @@ if TYPE_CHECKING:
     from .model import Model
 
 JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+CACHE = click.option(
+    "--cache",
+    metavar="DIR|none",
+    help="Where to keep what comes from an address, so that it is not fetched again; the user's cache if not given.",
+)
+
+
+def choose_cache(choice: str | None, target: str) -> Cache | None:
+    """Return the cache that ``--cache`` means for a target; files need none."""
+    if choice == "none" or not is_address(target):
+        return None
+    if choice is not None:
+        return Cache(Path(choice))
+    from platformdirs import user_cache_path
+
+    return Cache(user_cache_path("pointstream", appauthor=False))
 
 
 @click.command()
@@ -61,10 +78,12 @@ def verify(model: str, scans: tuple[str, ...], more: tuple[str, ...], as_json: b
     else:
         _print_report(report)
     if not report.ok:
-        sys.exit(1)
+        click.get_current_context().exit(1)
 
 
-def _parse_bounds(ctx: click.Context, param: click.Parameter, value: str | None) -> tuple[float, ...] | None:
+def _parse_bounds(
+    ctx: click.Context, param: click.Parameter, value: str | None
+) -> tuple[float, float, float, float, float, float] | None:
     if value is None:
         return None
     try:
@@ -73,7 +92,8 @@ def _parse_bounds(ctx: click.Context, param: click.Parameter, value: str | None)
         raise click.BadParameter(f"{value!r} is not six numbers X0,Y0,Z0,X1,Y1,Z1", ctx, param) from error
     if len(bounds) != 6 or not all(low <= high for low, high in zip(bounds[:3], bounds[3:], strict=True)):
         raise click.BadParameter(f"{value!r} is not X0,Y0,Z0,X1,Y1,Z1 with X0 <= X1 and so on", ctx, param)
-    return bounds
+    x0, y0, z0, x1, y1, z1 = bounds
+    return x0, y0, z0, x1, y1, z1
 
 
 @click.command()
@@ -82,27 +102,94 @@ def _parse_bounds(ctx: click.Context, param: click.Parameter, value: str | None)
 @click.option("--level", type=click.IntRange(min=0), help="Deepest level of the tree, 0 for the root alone.")
 @click.option("--spacing", type=click.FloatRange(min=0, min_open=True), help="Detail that is enough, model units.")
 @click.option("--bounds", callback=_parse_bounds, help="X0,Y0,Z0,X1,Y1,Z1 in model units: only samples inside.")
-def export(model: str, out: Path, level: int | None, spacing: float | None, bounds: tuple[float, ...] | None) -> None:
+@CACHE
+def export(
+    model: str,
+    out: Path,
+    level: int | None,
+    spacing: float | None,
+    bounds: tuple[float, float, float, float, float, float] | None,
+    cache: str | None,
+) -> None:
     """Write the samples of MODEL to OUT.{ply,las,laz,xyz,npz}, every one once."""
     if level is not None and spacing is not None:
         raise click.UsageError("give --level or --spacing, not both")
-    from .writers import write_points
+    from .writers import SUFFIXES, Target, write_points
 
-    with open_model(model) as opened:
+    if out.suffix.lower() not in SUFFIXES:
+        raise click.UsageError(f"{out}: the suffix says the format; use one of {', '.join(SUFFIXES)}")
+    with open_model(model, cache=choose_cache(cache, model)) as opened:
         header = opened.header
         choice = {"level": level, "spacing": spacing, "bounds": bounds}
         total = opened.count(**choice)  # type: ignore[arg-type]
         # Counts stand at the head of most formats, so what the bounds cut is counted first.
         count = total if bounds is None else sum(map(len, _batches(opened, "counting", total, choice)))
-        write_points(
-            out,
-            _batches(opened, "exporting", count, choice),
+        target = Target(
             count=count,
-            crs=header.crs,
             attributes=opened.attributes,
+            bounds=opened.reach,
             position_error=header.position_error,
+            origin=header.origin,
+            step=header.step,
+            crs=header.crs,
         )
-    click.echo(f"{out}: {count} samples", err=True)
+        dropped = write_points(out, _batches(opened, "exporting", count, choice), target)
+        complete = opened.info["complete"]
+    click.echo(f"{out}: {count} samples" + ("" if complete else " of a file that is cut short"), err=True)
+    for name in dropped:
+        click.echo(f"{out}: left out {name}, the format has no room for it", err=True)
+
+
+@click.command()
+@click.argument("model")
+@click.argument("folder", metavar="DIR", type=click.Path(file_okay=False, path_type=Path))
+@click.option("--bounds", callback=_parse_bounds, help="X0,Y0,Z0,X1,Y1,Z1 in model units: only clouds that touch it.")
+@click.option("--spacing", type=click.FloatRange(min=0, min_open=True), help="Detail that is enough, model units.")
+@click.option(
+    "--bytes", "most_bytes", type=click.IntRange(min=1), help="Size of the copy, at most; coarse comes first."
+)
+@JSON
+def fetch(
+    model: str,
+    folder: Path,
+    bounds: tuple[float, float, float, float, float, float] | None,
+    spacing: float | None,
+    most_bytes: int | None,
+    as_json: bool,
+) -> None:
+    """Copy MODEL into DIR for use without a network; interrupted, the same command goes on where it was.
+
+    The copy of a part is a MODEL too: a coarser one outside the part.
+    """
+    from .fetch import FetchOptions, copy_name
+    from .fetch import fetch as fetch_model
+
+    out = folder / copy_name(model)
+    options = FetchOptions(region=Region(bounds=bounds, spacing=spacing), most_bytes=most_bytes)
+    with ExitStack() as stack:
+        try:
+            report = asyncio.run(
+                fetch_model(
+                    open_store(model, clock=time.monotonic),
+                    out,
+                    options,
+                    begin=lambda total: stack.enter_context(progress("fetching bytes", total)),
+                )
+            )
+        except KeyboardInterrupt:
+            click.echo(f"{out}: paused; the same command goes on", err=True)
+            raise
+    if as_json:
+        click.echo(json.dumps(report.to_json()))
+    else:
+        part = "the whole model" if report.complete else f"{report.clouds} of {report.clouds_total} clouds"
+        click.echo(
+            f"{out}: {part}, {report.bytes:,} of {report.bytes_total:,} bytes, {report.bytes_fetched:,} of them new"
+        )
+    for problem in report.problems:
+        click.echo(f"pointstream: {problem}", err=True)
+    if report.problems:
+        click.get_current_context().exit(1)
 
 
 def _batches(model: Model, label: str, total: int, choice: dict[str, Any]) -> Iterator[PointBatch]:
@@ -149,7 +236,7 @@ def _rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "levels", str(facts["levels"])
     yield "bytes", f"{facts['bytes']:,}"
     if not facts["complete"]:
-        yield "incomplete", f"only the first {facts['bytes_here']:,} bytes are here: a coarser model"
+        yield "incomplete", "the file was cut short: what is here is a coarser model"
     yield "bits per sample", ", ".join(f"{name} {value:.2f}" for name, value in bits.items() if value)
     yield "spacing", f"{facts['spacing']:.6g}"
     yield "spacing, stored / LPC", " ".join(f"{ratio:.3f}" for ratio in facts["spacing_ratio"]) + "  (5%, 50%, 95%)"

@@ -32,14 +32,17 @@ SUMMARIES: Mapping[str, str] = {
     "info": "Say what a model holds.",
     "verify": "Check a model, and its samples against the scans.",
     "export": "Write a model's samples to a scan file.",
+    "fetch": "Copy a model, or a part of it, for use offline.",
     "serve": "Serve the models of a directory over HTTP.",
+    "sign": "Sign an address of a model or folder, for a time.",
+    "doctor": "Say whether a host can serve models, and what to change.",
     "link": "Put a slow link in front of a server.",
     "stream": "Stream a model over a link and report what arrived when.",
     "render": "Draw a model into a picture.",
 }
 """Help by name, in the order of a first tour: what ``--help`` prints without importing anything."""
 
-EXTRAS: Mapping[str, str] = {"build": "server", "serve": "server"}
+EXTRAS: Mapping[str, str] = {"build": "server", "serve": "server", "sign": "server"}
 """Extra of the distribution that a command needs; the others need ``client``."""
 
 OWN_PACKAGES = frozenset({"lpc", "pointbuild", "pointserve", "pointstream", "pointlink", "pointview"})

@@ -153,7 +153,7 @@ class Matcher:
         columns = [np.asarray(rows["lattice"])]
         for attribute in self._attributes:
             codes = _codes(attribute, rows[attribute.name])
-            columns.append(codes.reshape(len(rows), -1).astype(np.uint64).view(np.int64))
+            columns.append(codes.reshape(len(rows), attribute.components).astype(np.uint64).view(np.int64))
         return _hash_integers(np.concatenate(columns, axis=1))
 
     def _pair(

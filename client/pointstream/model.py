@@ -24,18 +24,21 @@ if TYPE_CHECKING:
     from lpc.header import Header
     from lpc.index import IndexTree
 
+    from .cache import Cache
     from .stores import Store
 
 T = TypeVar("T")
 
 
-def open_model(target: str) -> Model:
+def open_model(target: str, *, cache: Cache | None = None) -> Model:
     """Open a model with one read of 64 KiB.
 
     Parameters
     ----------
     target : str
         Path of a .lpc file or http(s) address of one; any start of a file will do.
+    cache : Cache, optional
+        Where to keep what comes from an address.
 
     Raises
     ------
@@ -46,14 +49,14 @@ def open_model(target: str) -> Model:
     """
     loop = _BackgroundLoop()
     try:
-        return Model(loop, loop.wait(_open(target)))
+        return Model(loop, loop.wait(_open(target, cache)))
     except BaseException:
         loop.stop()
         raise
 
 
-async def _open(target: str) -> Reader:
-    store: Store = open_store(target, clock=time.monotonic)
+async def _open(target: str, cache: Cache | None) -> Reader:
+    store: Store = open_store(target, clock=time.monotonic, cache=cache)
     try:
         return await Reader.open(store)
     except BaseException:
@@ -97,13 +100,20 @@ class Model:
     @property
     def info(self) -> dict[str, Any]:
         """What ``pointstream info --json`` prints."""
-        return info_dict(self.header, length=self._reader.length)
+        return {**info_dict(self.header), "complete": self._reader.complete}
 
     @property
     def attributes(self) -> dict[str, np.dtype[Any]]:
         """Names of what every sample carries and the dtypes of the values, constants included."""
         stored = {item.name: np.dtype(item.dtype) for item in self.header.attributes}
         return stored | {name: constant.fill(0).dtype for name, constant in self.header.constants.items()}
+
+    @property
+    def reach(self) -> tuple[float, float, float, float, float, float]:
+        """Box x0, y0, z0, x1, y1, z1 that no decoded sample leaves: the bounds and the position error around them."""
+        x0, y0, z0, x1, y1, z1 = self.header.bounds
+        error = self.header.position_error
+        return x0 - error, y0 - error, z0 - error, x1 + error, y1 + error, z1 + error
 
     def read(
         self, *, bounds: Sequence[float] | None = None, spacing: float | None = None, level: int | None = None

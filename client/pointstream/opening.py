@@ -5,6 +5,8 @@ from __future__ import annotations
 import zlib
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from lpc.errors import ModelChanged, Truncated
 from lpc.header import HEADER_PROBE, Header, parse_header
 from lpc.index import IndexTree
@@ -25,12 +27,17 @@ class Opening:
         As soon as page 0 is there, or when the file is known to end before it (then without any node).
     needed : int
         Bytes of prefix that the next step takes; what is there may be more.
+
+    Parameters
+    ----------
+    probe : int
+        Bytes of the first read.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, probe: int = HEADER_PROBE) -> None:
         self.header: Header | None = None
         self.index: IndexTree | None = None
-        self.needed = HEADER_PROBE
+        self.needed = probe
 
     def look(self, data: bytes | bytearray, *, ended: bool = False) -> bool:
         """Take in a prefix that has grown; True once the index is there.
@@ -75,13 +82,35 @@ async def open_index(store: Store) -> IndexTree:
     ------
     StoreError, FormatError
     """
-    opening, data = Opening(), b""
+    opening, data = Opening(await store.opening_bytes()), b""
     while True:
-        part = await store.read(ByteRange(len(data), max(opening.needed, HEADER_PROBE)))
+        part = await store.read(ByteRange(len(data), opening.needed))
         data += part
         if opening.look(data, ended=len(data) < opening.needed or not part):
             assert opening.index is not None
+            if vouch_opening(store, opening, data):
+                _vouch_clouds(store, opening.index, data)
             return opening.index
+
+
+def vouch_opening(store: Store, opening: Opening, data: bytes | bytearray) -> bool:
+    """Tell a store that header and first page passed their checks; True if it keeps such things."""
+    assert opening.index is not None
+    start = opening.index.header.page0
+    kept = store.vouch(ByteRange(0, start), bytes(data[:start]))
+    if opening.index.page_loaded[0]:
+        page = opening.index.page_range(0)
+        store.vouch(page, bytes(data[page.start : page.stop]))
+    return kept
+
+
+def _vouch_clouds(store: Store, index: IndexTree, data: bytes) -> None:
+    """Tell a store which clouds of the first page came along and are sound."""
+    for node in np.flatnonzero(index.available(len(data))).tolist():
+        place = index.cloud_range(node)
+        cloud = data[place.start : place.stop]
+        if zlib.crc32(cloud) == int(index.crc[node]):
+            store.vouch(place, cloud)
 
 
 def add_page(index: IndexTree, page: int, data: bytes) -> None:

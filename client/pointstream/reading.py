@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lpc.errors import Corrupt, ModelChanged
+from lpc.page import page_bytes
 from lpc.ranges import coalesce
 
 from .decoding import decode_checked
@@ -136,9 +137,21 @@ class Reader:
 
     @property
     def length(self) -> int:
-        """Bytes of the file that are there."""
+        """Where what is there of the file ends."""
         size = self.index.header.bytes
         return size if self.store.length is None else min(size, self.store.length)
+
+    @property
+    def complete(self) -> bool:
+        """Whether all of the file is there."""
+        size = self.index.header.bytes
+        whole = not self.store.partial or bool(self.store.holds(np.array([0]), np.array([size]))[0])
+        return whole and self.length >= size
+
+    def reaches(self, starts: NDArray[np.int64], stops: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which ranges are there."""
+        here = stops <= self.length
+        return np.asarray(here & self.store.holds(starts, stops) if self.store.partial else here)
 
     async def select(self, region: Region = EVERYTHING) -> NDArray[np.int64]:
         """Find the nodes of a region, reading pages as needed; nodes that the file no longer has are left out.
@@ -157,7 +170,7 @@ class Reader:
             children = index.children[frontier[region.deeper(index, frontier)]].ravel()
             frontier = children[children >= 0].astype(np.int64)
         nodes = np.sort(np.concatenate(found))
-        return nodes[index.offset[nodes] + index.size[nodes] <= self.length]
+        return nodes[self.reaches(index.offset[nodes], index.offset[nodes] + index.size[nodes])]
 
     async def load_pages(self, nodes: NDArray[np.int64]) -> None:
         """Read the pages of these nodes, as far as the file reaches.
@@ -166,14 +179,15 @@ class Reader:
         ------
         StoreError, FormatError
         """
-        pages = [
-            page for page in self.index.missing_pages(nodes).tolist() if self.index.page_range(page).stop <= self.length
-        ]
+        pages = self.index.missing_pages(nodes)
+        starts = self.index.page_offset[pages]
+        sizes = np.array([page_bytes(self.index.header, page) for page in pages.tolist()], dtype=np.int64)
+        pages = pages[self.reaches(starts, starts + sizes)].tolist()
         ranges = [self.index.page_range(page) for page in pages]
         plan = coalesce(ranges, self.options.max_gap, self.options.max_bytes)
         for start in range(0, len(plan), self.options.parallel):
             runs = plan[start : start + self.options.parallel]
-            bodies = await asyncio.gather(*(self.read(place) for place, _ in runs))
+            bodies = await self._together([place for place, _ in runs])
             for (place, members), body in zip(runs, bodies, strict=True):
                 for member in members:
                     await self._add_page(pages[member], bytes(place.within(body, ranges[member])))
@@ -223,15 +237,29 @@ class Reader:
             self.store.forget(distrust_tags=True)
             return await self.store.read(wanted)
 
+    async def _together(self, places: list[ByteRange]) -> list[bytes]:
+        """Read ranges at the same time; if one fails the others are cut off."""
+        tasks = [asyncio.create_task(self.read(place)) for place in places]
+        try:
+            return await asyncio.gather(*tasks)
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
     async def _add_page(self, page: int, data: bytes) -> None:
+        place = self.index.page_range(page)
         for _ in range(self.options.tries - 1):
             try:
                 add_page(self.index, page, data)
             except Corrupt:
-                data = await self.read(self.index.page_range(page))
+                self.store.reject(place)
+                data = await self.read(place)
             else:
-                return
-        add_page(self.index, page, data)
+                break
+        else:
+            add_page(self.index, page, data)
+        self.store.vouch(place, data)
 
     async def _run(
         self, threads: ThreadPoolExecutor, place: ByteRange, nodes: list[int]
@@ -241,11 +269,15 @@ class Reader:
         parts = [bytes(place.within(body, self.index.cloud_range(node))) for node in nodes]
         clouds = await loop.run_in_executor(threads, self._decode, nodes, parts)
         for number, node in enumerate(nodes):
+            place = self.index.cloud_range(node)
             for _ in range(self.options.tries - 1):
                 if not isinstance(clouds[number], Corrupt):
                     break
-                again = await self.read(self.index.cloud_range(node))
-                clouds[number : number + 1] = await loop.run_in_executor(threads, self._decode, [node], [again])
+                self.store.reject(place)
+                parts[number] = await self.read(place)
+                clouds[number : number + 1] = await loop.run_in_executor(threads, self._decode, [node], [parts[number]])
+            if not isinstance(clouds[number], Corrupt):
+                self.store.vouch(place, parts[number])
         return list(zip(nodes, clouds, strict=True))
 
     def _decode(self, nodes: list[int], parts: list[bytes]) -> list[Cloud | Corrupt]:

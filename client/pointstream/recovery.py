@@ -19,7 +19,7 @@ class RecoveryOptions:
     """
 
     first_pause: float = 1.0
-    longest_pause: float = 30.0
+    longest_pause: float = 10.0
     reloads: int = 3
     reload_seconds: float = 60.0
 

@@ -12,7 +12,8 @@ those allowed by the estimated network bandwidth, and forgetting the rest". A li
    its headers and, only when less than a round trip of bytes is outstanding, the time in which the link would run
    dry: ``gap <= overhead + max(0, rate * rtt - outstanding)``.
 3. *A request is short.* At most ``rate * request_seconds`` bytes, but at least one object, so that urgent ones get
-   through between two requests and a lost one costs little.
+   through between two requests and a lost one costs little. Not shorter either: on 1.25 Mbit/s, 0.1 s at a time, the
+   heads of a usual server's replies (370 bytes) take 3% of the line.
 4. *The queue in the network is short.* A byte asked for now arrives after everything asked before: an urgent cloud
    waits for ``outstanding / rate``. So outstanding bytes stay within the *window*, the bandwidth-delay product, plus
    one look interval (we look once a frame and whenever an object lands), plus one request. Less would leave the link
@@ -68,13 +69,13 @@ class SchedulerOptions:
         Wants that are looked at; the rest comes with a later frame.
     """
 
-    request_seconds: float = 0.1
-    smallest_request: int = 4096
+    request_seconds: float = 0.125
+    smallest_request: int = 8192
     largest_request: int = 1 << 19
     overhead: int = 400
     look_seconds: float = 1 / 30
     gain: float = 1.25
-    most_requests: int = 6
+    most_requests: int = 8
     most_window: int = 4 << 20
     local_window: int = 1 << 20
     local_gap: int = 4096

@@ -124,13 +124,15 @@ async def verify(
     problems = _Problems()
     header = reader.index.header
     await _load_all_pages(reader, problems)
-    nodes = np.flatnonzero(reader.index.available(reader.length))
-    complete = reader.length >= header.bytes
+    index, complete = reader.index, reader.complete
+    nodes = np.flatnonzero(index.known & reader.reaches(index.offset, index.offset + index.size))
     if not complete:
-        problems.add(
-            f"the file is cut short: {reader.length} of {header.bytes} bytes are here,"
-            f" {header.nodes - len(nodes)} of {header.nodes} clouds are missing"
+        what = (
+            "is a partial copy"
+            if reader.store.partial
+            else f"is cut short: {reader.length} of {header.bytes} bytes are here"
         )
+        problems.add(f"the file {what}, {header.nodes - len(nodes)} of {header.nodes} clouds are missing")
     elif reader.index.page_loaded.all():
         await _check_digest(reader, problems)
     with (

@@ -54,6 +54,11 @@ class Wanted:
         self._pages, self._count = set(), 0
         self._note(now)
 
+    @property
+    def anything(self) -> bool:
+        """Whether anything is wanted that can still come."""
+        return self._since is not None
+
     def seconds(self, now: float) -> float:
         """Sum up the time in which anything was wanted."""
         return self._total + (0.0 if self._since is None else now - self._since)

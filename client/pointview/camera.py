@@ -14,11 +14,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from lpc.errors import FormatError
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
     from lpc.header import Header
 
 Vector = tuple[float, float, float]

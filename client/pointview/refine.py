@@ -17,7 +17,6 @@ Nothing here does I/O or reads a clock; equal arguments give equal cuts.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -27,6 +26,8 @@ from numpy.typing import NDArray
 from .splats import CLOSING, LARGEST
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from lpc.index import IndexTree
 
     from .camera import Camera
@@ -59,9 +60,9 @@ class Cut:
     starved : (n,) bool
         Nodes drawn grown because a visible child is missing.
     wants : (m,) int64
-        Nodes whose clouds are wanted, most urgent first.
+        Nodes that would refine the picture, most urgent first; those that are not known yet stand for their page.
     pages : (p,) int64
-        Index pages wanted, most urgent first.
+        Pages of the wants that are not known yet, most urgent first.
     culled : Culled
     splats : int
         Samples in the clouds of `nodes`.
@@ -183,7 +184,7 @@ def refine(
     Cost is proportional to the visited nodes: the cut and the children of its refined nodes.
     """
     if not index.known[0]:
-        return _empty(wants=[], pages=[0], culled=Culled())
+        return _empty(wants=[0], pages=[0], culled=Culled())
     sieve = _Sieve(index, camera, cull_backfaces)
     if not resident[0]:
         visible, _ = sieve.look(np.zeros(1, dtype=np.int64))
@@ -217,14 +218,33 @@ def refine(
     )
 
 
-def count_splats(
+def drawn_up_to(
     index: IndexTree, camera: Camera, tolerance: float, resident: NDArray[np.bool_], *, cull_backfaces: bool = True
-) -> int:
-    """Count the samples that `refine` would draw, without the rest of its work (LPC 4, rendering on a budget)."""
-    if not (index.known[0] and resident[0]):
-        return 0
-    sieve = _Sieve(index, camera, cull_backfaces)
-    return sum(int(index.samples[level.nodes].sum()) for level in _descend(sieve, tolerance, resident))
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Tell which tolerances draw which clouds, in one traversal.
+
+    A node is drawn when all its ancestors are coarser than the tolerance: up to the least projected spacing among them.
+
+    Returns
+    -------
+    limit : (n,) float64
+        Largest tolerance that draws the cloud, pixels; infinite for the root. Clouds that no tolerance from `tolerance`
+        on draws are left out.
+    samples : (n,) int64
+        Samples of the cloud.
+    """
+    limits: list[NDArray[np.float64]] = []
+    samples: list[NDArray[np.int64]] = []
+    limit = np.full(1, np.inf)
+    if index.known[0] and resident[0]:
+        for level in _descend(_Sieve(index, camera, cull_backfaces), tolerance, resident):
+            limits.append(limit)
+            samples.append(index.samples[level.nodes])
+            below = np.minimum(limit, level.spacing_px)
+            limit = np.repeat(below, 2).reshape(-1, 2)[level.drawn]
+    if not limits:
+        return np.empty(0), np.empty(0, dtype=np.int64)
+    return np.concatenate(limits), np.concatenate(samples)
 
 
 def _shown_spacing(index: IndexTree, levels: list[_Level]) -> list[NDArray[np.float64]]:
@@ -252,10 +272,9 @@ def _missing(index: IndexTree, camera: Camera, levels: list[_Level], priority: P
         shown_px = np.concatenate([np.repeat(level.spacing_px, 2).reshape(-1, 2)[level.missing] for level in levels])
         child_px = np.concatenate([level.child_spacing_px[level.missing] for level in levels])
         nodes = nodes[np.lexsort((nodes, -_error_per_byte(index, camera, nodes, shown_px, child_px)))]
-    known = index.known[nodes]
-    pages = nodes[~known] // index.header.page_nodes
+    pages = nodes[~index.known[nodes]] // index.header.page_nodes
     _, first = np.unique(pages, return_index=True)
-    return nodes[known], pages[np.sort(first)]
+    return nodes, pages[np.sort(first)]
 
 
 def _error_per_byte(

@@ -1,24 +1,47 @@
-"""How large a splat must be so that a random sampling shows a closed surface.
+"""The splats: large enough that a random sampling shows a closed surface, and no larger.
 
 Samples with a spacing of r (one per area r^2, placed at random) leave the share `exp(-area / r^2)` of the surface
 uncovered by splats of that area. LPC 4 draws squares of side r: 37% holes, hidden there by a projection that is
-larger than need be. Splats here have an area of `CLOSING^2 r^2`: 0.1% on a surface that faces the eye, less where it
-is tilted: its samples move together, the splats stay as large. Measured on closed surfaces at any cut, 0.03% or less
-of the pixels show the background or the far side.
+larger than need be. Splats here have an area of `CLOSING^2 r^2`: 0.5%, in gaps hardly wider than a splat, which are
+closed in the picture (`HOLE`). What remains is 0.02% of a closed surface, and silhouettes grow by a third of the
+spacing.
+
+A splat is a square of pixels where it covers only a few. A larger one is a disc: in the tangent plane of its sample
+where there is a normal, which keeps silhouettes thin and depths right; else facing the eye. Discs overlap by far, and a
+*bulge* decides between them: the depth grows with the square of the distance from the centre, so the nearest sample
+is seen, each in a cell of its own.
 """
 
 from __future__ import annotations
 
 import math
 
-CLOSING = 2.7
+CLOSING = 2.3
 """Side of a square splat over the spacing of its samples; round splats have the same area."""
 
 ROUND = 2.0 / math.sqrt(math.pi)
 """Diameter of a disc over the side of the square of the same area."""
 
 ROUND_FROM = 2.0
-"""Splats larger than this many pixels are round; below, a square and a disc cover the same few pixels."""
+"""Splats with a side above this many pixels are discs; below, a square and a disc cover the same few pixels."""
 
-LARGEST = 220.0
-"""No splat has a larger side, pixels: its disc stays within 255, the least that OpenGL implementations allow."""
+BULGE = 0.5
+"""How far behind its centre the rim of a disc is, over its radius. Decides which is seen; the depth of a picture
+stays that of the disc."""
+
+STEEPEST = 0.15
+"""Least cosine between a disc's normal and the direction to the eye: one seen from the side would cover nothing."""
+
+LARGEST = 160.0
+"""No splat has a larger side, pixels: its disc stays within 255, the least that OpenGL implementations allow, even
+where the perspective stretches it at the rim of the picture."""
+
+HOLE = 1.0
+"""Widest half of a gap that is taken for a hole of the sampling, sides of the splats around it. Random samples leave
+one gap or other at any density, and no scan is evenly dense; what fits into such a gap is no detail of the model."""
+
+LARGEST_HOLE = 64
+"""And in pixels."""
+
+WALLS = 7
+"""Directions, of eight, in which a nearer surface must stand around a hole: fewer would round off corners."""

@@ -1,4 +1,4 @@
-"""What ``pointstream info --json`` prints and `Model.info` holds; the keys are a promise to other programs."""
+"""What `info` and `build` print of a model: the one mapping from a header to the contract's keys."""
 
 from __future__ import annotations
 
@@ -7,20 +7,23 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .header import Header
 
-FORMAT = "lpc 1.0"
-BITS = ("position", "normal", "color", "other", "index", "total")
+FORMAT = "lpc 1"
 
 
 def info_dict(header: Header, *, length: int | None = None) -> dict[str, Any]:
-    """Describe a model by its header.
+    """Describe a model in plain values, ready for JSON.
 
     Parameters
     ----------
     header : Header
     length : int, optional
-        Bytes of the file that are there, if it may have been cut short.
+        Bytes of the file that are there; None: all of them.
+
+    Returns
+    -------
+    dict
+        Lengths in model units; ``bounds`` is [min xyz, max xyz], ``attributes`` the names that `export` writes.
     """
-    low, high = list(header.bounds[:3]), list(header.bounds[3:])
     return {
         "format": FORMAT,
         "complete": length is None or length >= header.bytes,
@@ -29,17 +32,17 @@ def info_dict(header: Header, *, length: int | None = None) -> dict[str, Any]:
         "levels": header.levels,
         "cloud_size": header.cloud_size,
         "bytes": header.bytes,
-        "bytes_here": header.bytes if length is None else min(length, header.bytes),
-        "bits_per_sample": {name: header.bits_per_sample.get(name, 0.0) for name in BITS},
+        "bits_per_sample": dict(header.bits_per_sample),
         "spacing": header.spacing,
-        "spacing_ratio": list(header.spacing_ratio),
         "position_error": header.position_error,
-        "bounds": [low, high],
-        "attributes": [attribute.name for attribute in header.attributes] + sorted(header.constants),
-        "constants": {name: constant.to_json()["value"] for name, constant in sorted(header.constants.items())},
+        "bounds": [list(header.bounds[:3]), list(header.bounds[3:])],
+        "attributes": [attribute.name for attribute in header.attributes] + list(header.constants),
+        "constants": {name: constant.to_json()["value"] for name, constant in header.constants.items()},
         "crs": header.crs,
         "left_out": dict(header.left_out),
         "rejected": dict(header.rejected),
+        "spacing_ratio": list(header.spacing_ratio),
+        "seed": header.seed,
         "generator": header.generator,
         "digest": header.digest,
     }

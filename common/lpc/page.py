@@ -44,6 +44,7 @@ PAGE_HEADER = 48
 CHILD_PAGES = 3  # 2 * page_nodes consecutive children touch at most three pages
 SMALLEST_CLOUD = 16  # magic, frame header, one block header and checksum of any zstd frame
 NO_CONE = 65535
+COINCIDENT = 65535  # samples of an inner node whose samples are all at one place
 
 _FIXED = struct.Struct("<8sIIII3Q")
 
@@ -188,7 +189,7 @@ def _check_records(records: NDArray[Any], header: Header, page: int) -> None:
         (records["size"] < SMALLEST_CLOUD, "bytes"),
         (samples < 1, "samples"),
         (samples > MAX_SAMPLES, "samples"),
-        (inner & (samples > header.cloud_size), "samples"),
+        (inner & (samples > max(header.cloud_size, COINCIDENT)), "samples"),
         (subtree > header.samples, "subtree"),
         (np.where(inner, subtree <= samples, subtree != samples), "subtree"),
     ):

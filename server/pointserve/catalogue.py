@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from lpc.errors import FormatError
 from lpc.header import HEADER_PROBE, Header, parse_header
 
+from .files import names_inside
 from .paths import MAX_DEPTH, MODEL_SUFFIX, is_plain_name, url_path
 
 if TYPE_CHECKING:
@@ -150,7 +151,7 @@ def _model_files(root: Path) -> Iterator[tuple[tuple[str, ...], os.stat_result]]
             try:
                 if entry.is_dir(follow_symlinks=False) and len(names) + 2 <= MAX_DEPTH:
                     folders.append((*names, entry.name))
-                elif entry.name.endswith(MODEL_SUFFIX) and entry.is_file() and _ends_below(entry, root):
+                elif entry.name.endswith(MODEL_SUFFIX) and entry.is_file() and _is_inside(entry, root):
                     yield (*names, entry.name), entry.stat()
                     found += 1
             except OSError:
@@ -159,8 +160,8 @@ def _model_files(root: Path) -> Iterator[tuple[tuple[str, ...], os.stat_result]]
                 return
 
 
-def _ends_below(entry: os.DirEntry[str], root: Path) -> bool:
-    return not entry.is_symlink() or Path(os.path.realpath(entry.path)).is_relative_to(root)
+def _is_inside(entry: os.DirEntry[str], root: Path) -> bool:
+    return not entry.is_symlink() or bool(names_inside(root, Path(entry.path)))
 
 
 def _read_entry(path: Path, names: tuple[str, ...], size: int, picture: bool) -> Entry:

@@ -202,12 +202,9 @@ class FileStore:
     def _descriptor(self, names: tuple[str, ...]) -> int:
         # Links are resolved first, and the result then walked without following any: whatever is exchanged in
         # between, the walk cannot leave the folder.
-        inside = Path(os.path.realpath(self.root.joinpath(*names)))
-        if not inside.is_relative_to(self.root) or inside == self.root:
+        real = names_inside(self.root, self.root.joinpath(*names))
+        if not real:
             raise NotFound(f"{names[-1]} lies outside the served folder")
-        real = inside.relative_to(self.root).parts
-        if not all(map(is_plain_name, real)):
-            raise NotFound(f"{names[-1]} is hidden")
         at = os.open(self.root, os.O_RDONLY | os.O_DIRECTORY)
         for depth, name in enumerate(real):
             # O_NONBLOCK: opening a pipe must not wait for its writer.
@@ -218,6 +215,13 @@ class FileStore:
                 os.close(at)
             at = below
         return at
+
+
+def names_inside(root: Path, path: Path) -> tuple[str, ...] | None:
+    """Names below `root` (resolved) where a path ends when links are followed; None if outside it or hidden."""
+    real = Path(os.path.realpath(path))
+    names = real.relative_to(root).parts if real.is_relative_to(root) else None
+    return names if names is None or all(map(is_plain_name, names)) else None
 
 
 def _identity(status: os.stat_result) -> Identity:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from html import escape
 from typing import TYPE_CHECKING
 
@@ -25,7 +26,7 @@ pre { background: #8881; padding: .4rem .7rem; border-radius: 4px; margin: 0; wh
 """
 
 
-def catalogue_page(entries: Iterable[Entry], origin: str) -> str:
+def catalogue_page(entries: Iterable[Entry], origin: str, *, query: str = "") -> str:
     """Return the page of all models.
 
     Parameters
@@ -34,29 +35,35 @@ def catalogue_page(entries: Iterable[Entry], origin: str) -> str:
         In the order in which they are shown.
     origin : str
         Scheme and host under which the visitor reached the server, ``http://host:8080``.
+    query : str
+        What the visitor's address has after ``?``: links repeat it, so that a signed folder can be walked.
     """
     shown = list(entries)
     models = [entry for entry in shown if entry.header is not None]
     samples = sum(entry.header.samples for entry in models if entry.header is not None)
     summary = f"{len(models)} model{'' if len(models) == 1 else 's'}, {count(samples)} samples"
-    articles = "\n".join(_article(entry, origin) for entry in shown) or "<p>No models are in this folder yet.</p>"
+    suffix = f"?{query}" if query else ""
+    articles = (
+        "\n".join(_article(entry, origin, suffix) for entry in shown) or "<p>No models are in this folder yet.</p>"
+    )
     return (
         '<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>Point models</title>\n<style>{_STYLE}</style>\n"
         f"<h1>Point models</h1>\n<p>{summary}</p>\n{articles}\n"
-        '<footer>The same as <a href="/catalogue.json">JSON</a>. '
+        f'<footer>The same as <a href="catalogue.json{escape(suffix)}">JSON</a>. '
         "The lines above open a model with pointstream.</footer>\n"
     )
 
 
-def _article(entry: Entry, origin: str) -> str:
-    link = f'<h2><a href="{escape(entry.path)}" download>{escape("/".join(entry.names))}</a></h2>'
+def _article(entry: Entry, origin: str, suffix: str) -> str:
+    link = f'<h2><a href="{escape(entry.path + suffix)}" download>{escape("/".join(entry.names))}</a></h2>'
     if entry.header is None:
         return f'<article>\n{link}\n<p class="problem">Not a model: {escape(entry.problem or "")}</p>\n</article>'
-    picture = f'<img src="{escape(entry.path)}.png" alt="">\n' if entry.picture else ""
+    picture = f'<img src="{escape(entry.path + ".png" + suffix)}" alt="">\n' if entry.picture else ""
     facts = "\n".join(f"<dt>{name}</dt><dd>{escape(value)}</dd>" for name, value in _facts(entry))
-    command = f"<pre>pointstream view {escape(origin + entry.path)}</pre>"
+    address = origin + entry.path + suffix
+    command = f"<pre>pointstream view {escape(shlex.quote(address))}</pre>"
     return f"<article>\n{picture}{link}\n<dl>\n{facts}\n</dl>\n{command}\n</article>"
 
 
@@ -66,9 +73,10 @@ def _facts(entry: Entry) -> list[tuple[str, str]]:
     low, high = header.bounds[:3], header.bounds[3:]
     size = " × ".join(f"{b - a:.6g}" for a, b in zip(low, high, strict=True))
     attributes = [attribute.name for attribute in header.attributes] + sorted(header.constants)
+    bits = header.bits_per_sample.get("total", 8 * header.bytes / header.samples)
     facts = [
         ("samples", f"{count(header.samples)} in {count(header.nodes)} clouds, {header.levels} levels"),
-        ("size", f"{byte_size(entry.size)}, {8 * header.bytes / header.samples:.1f} bits a sample"),
+        ("size", f"{byte_size(entry.size)}, {bits:.1f} bits a sample"),
         ("attributes", ", ".join(attributes) or "none"),
         ("extent", f"{size}, spacing {header.spacing:.3g}, error at most {header.position_error:.2g}"),
         ("bounds", f"{_point(low)} to {_point(high)}"),

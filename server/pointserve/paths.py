@@ -6,6 +6,7 @@ never become a separator or a climb: whatever spelling hides one, the piece it s
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from urllib.parse import quote, unquote_to_bytes
 
 MODEL_SUFFIX = ".lpc"
@@ -16,18 +17,55 @@ MAX_NAME_BYTES = 255
 MAX_DEPTH = 16
 
 
-def model_names(raw_path: str) -> tuple[str, ...] | None:
-    """Names of folders and file that a raw URL path asks for, or None if it can name nothing that is served."""
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A file or folder that a path names, whether it is there or not.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Of folders and file below the served folder.
+    folder : bool
+        The path ends with a slash.
+    """
+
+    names: tuple[str, ...]
+    folder: bool = False
+
+    @property
+    def path(self) -> str:
+        """The path in its one canonical spelling."""
+        if not self.names:
+            return "/"
+        return url_path(self.names) + ("/" if self.folder else "")
+
+    def covers(self, other: Place) -> bool:
+        """Whether another place is this one, below this folder, or the picture of this model."""
+        if self.folder:
+            return other.names[: len(self.names)] == self.names and (other.folder or len(other.names) > len(self.names))
+        picture = (*self.names[:-1], self.names[-1] + ".png")
+        return not other.folder and other.names in (self.names, picture)
+
+
+def place_of(raw_path: str) -> Place | None:
+    """Read a raw URL path; None if it can name nothing below the folder."""
     pieces = raw_path.split("/")
     if pieces[0] or not 2 <= len(pieces) <= MAX_DEPTH + 1:
         return None
+    folder = not pieces[-1]
     try:
-        names = tuple(unquote_to_bytes(piece).decode() for piece in pieces[1:])
+        names = tuple(unquote_to_bytes(piece).decode() for piece in (pieces[1:-1] if folder else pieces[1:]))
     except UnicodeError:
         return None
-    if not all(map(is_plain_name, names)) or content_type(names[-1]) is None:
+    return Place(names, folder) if all(map(is_plain_name, names)) else None
+
+
+def model_names(raw_path: str) -> tuple[str, ...] | None:
+    """Names of folders and file that a raw URL path asks for, or None if it can name nothing that is served."""
+    place = place_of(raw_path)
+    if place is None or place.folder or content_type(place.names[-1]) is None:
         return None
-    return names
+    return place.names
 
 
 def is_plain_name(name: str) -> bool:

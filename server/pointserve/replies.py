@@ -7,26 +7,58 @@ short, the peer stalls), the next reply must never land inside the old body.
 from __future__ import annotations
 
 import asyncio
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from aiohttp import web
 from multidict import CIMultiDict
 
+from .accesslog import SENT_BYTES
+
 if TYPE_CHECKING:
-    from .config import ServeConfig
     from .files import OpenFile
     from .ranges import Part, Verdict
+    from .rate import RateCap
 
 SMALL = 256 * 1024
-"""Bodies up to here are read and sent in one piece; larger ones go piece by piece through sendfile."""
+"""Bodies up to here are read and sent in one piece; larger ones go piece by piece."""
 
-PIECE = 512 * 1024
+LARGE = 4 * 1024 * 1024
+"""Parts from here on go through sendfile: it spares copies, but each call waits for the socket to drain, which below
+this size costs more than the copies do (benchmarks/serve.py)."""
+
+PIECE = 1024 * 1024
 """What one call of sendfile is given, so that a stalled reader is noticed between two."""
 
-BODY_BYTES = web.ResponseKey("body_bytes", int)
-"""Content bytes sent, for the access log."""
-
 Fields = tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pace:
+    """How fast replies may and have to go.
+
+    Parameters
+    ----------
+    patience : float
+        Seconds for which a reader may take nothing.
+    slowest : float
+        Bytes a second that it has to take beyond that.
+    cap : RateCap, optional
+        What one address may have a second.
+    """
+
+    patience: float
+    slowest: float
+    cap: RateCap | None = None
+
+    async def turn(self, request: web.Request, size: int) -> None:
+        """Wait until the peer may have `size` more bytes."""
+        if self.cap is not None and (delay := self.cap.delay(request.remote or "?", size)) > 0:
+            await asyncio.sleep(delay)
+
+    def deadline(self, request: web.Request, size: int) -> _Deadline:
+        """Bound the time in which the peer takes `size` bytes."""
+        return _Deadline(request, self.patience + size / self.slowest)
 
 
 class FileShrunkError(Exception):
@@ -34,7 +66,7 @@ class FileShrunkError(Exception):
 
 
 async def send(
-    request: web.Request, file: OpenFile, verdict: Verdict, *, extra: Fields, config: ServeConfig
+    request: web.Request, file: OpenFile, verdict: Verdict, *, extra: Fields, pace: Pace
 ) -> web.StreamResponse:
     """Send a reply.
 
@@ -48,8 +80,8 @@ async def send(
         What `ranges.judge` decided.
     extra : tuple of (str, str)
         More header fields.
-    config : ServeConfig
-        Its `patience` and `slowest` bound the time of the reply.
+    pace : Pace
+        How fast it may and has to go.
 
     Raises
     ------
@@ -65,22 +97,25 @@ async def send(
     headers["Content-Length"] = str(verdict.length)
     if not verdict.parts:
         return web.Response(status=verdict.status, headers=headers)
-    if verdict.length <= SMALL:
+    small = SMALL if pace.cap is None else min(SMALL, pace.cap.piece)
+    if verdict.length <= small:
         response: web.StreamResponse = web.Response(
             status=verdict.status, headers=headers, body=await _small_body(file, verdict)
         )
-        async with _deadline(request, config, verdict.length):
+        await pace.turn(request, verdict.length)
+        async with pace.deadline(request, verdict.length):
             await response.prepare(request)
             await response.write_eof()
-    else:
-        response = web.StreamResponse(status=verdict.status, headers=headers)
-        await response.prepare(request)
-        for part in verdict.parts:
-            if part.head:
-                await response.write(part.head)
-            await _send_part(request, response, file, part, config)
-        await response.write_eof(verdict.tail)
-    response[BODY_BYTES] = verdict.length
+        return response
+    response = web.StreamResponse(status=verdict.status, headers=headers)
+    request[SENT_BYTES] = 0
+    await response.prepare(request)
+    for part in verdict.parts:
+        if part.head:
+            await response.write(part.head)
+        await _send_part(request, response, file, part, pace)
+    await response.write_eof(verdict.tail)
+    request[SENT_BYTES] = verdict.length
     return response
 
 
@@ -105,37 +140,44 @@ async def _small_body(file: OpenFile, verdict: Verdict) -> bytes | bytearray:
 
 
 async def _send_part(
-    request: web.Request, response: web.StreamResponse, file: OpenFile, part: Part, config: ServeConfig
+    request: web.Request, response: web.StreamResponse, file: OpenFile, part: Part, pace: Pace
 ) -> None:
     loop = asyncio.get_running_loop()
-    at, piece = part.start, PIECE
+    transport = request.transport
+    by_kernel = part.stop - part.start >= LARGE and transport is not None and _has_sendfile(loop, transport)
+    piece = PIECE if by_kernel else SMALL
+    if pace.cap is not None:
+        piece = min(piece, pace.cap.piece)
+    at = part.start
     while at < part.stop:
         size = min(piece, part.stop - at)
-        transport = request.transport
+        await pace.turn(request, size)
         if transport is None or transport.is_closing():
             raise ConnectionResetError("the reader has gone")
-        async with _deadline(request, config, size):
-            if piece == PIECE:
-                try:
-                    sent = await loop.sendfile(transport, file.file, at, size, fallback=False)
-                except (asyncio.SendfileNotAvailableError, NotImplementedError):  # TLS, uvloop
-                    piece = SMALL
-                    continue
+        async with pace.deadline(request, size):
+            if by_kernel:
+                sent = await loop.sendfile(transport, file.file, at, size, fallback=False)
             else:
                 data = await file.read(at, size)
                 sent = len(data)
                 await response.write(data)
+        at += sent
+        request[SENT_BYTES] += sent
         if sent < size:
             raise ConnectionResetError("the file was cut short while being sent")
-        at += sent
 
 
-class _deadline:  # noqa: N801 - reads like asyncio.timeout, which it narrows
-    """Abort the connection of a reader that takes too long over `size` bytes."""
+def _has_sendfile(loop: asyncio.AbstractEventLoop, transport: asyncio.BaseTransport) -> bool:
+    """Whether the kernel can send a file over a connection: not over TLS, and not in uvloop, which has no such call."""
+    return isinstance(loop, asyncio.BaseEventLoop) and transport.get_extra_info("sslcontext") is None
 
-    def __init__(self, request: web.Request, config: ServeConfig, size: int) -> None:
+
+class _Deadline:
+    """Abort the connection of a reader that takes too long; a context that narrows `asyncio.timeout`."""
+
+    def __init__(self, request: web.Request, seconds: float) -> None:
         self._request = request
-        self._timeout = asyncio.timeout(config.patience + size / config.slowest)
+        self._timeout = asyncio.timeout(seconds)
 
     async def __aenter__(self) -> None:
         await self._timeout.__aenter__()

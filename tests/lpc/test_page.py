@@ -113,7 +113,7 @@ def test_a_page_is_not_taken_for_another() -> None:
         (48 + 12, struct.pack("<f", float("nan")), "radius"), (48 + 12, struct.pack("<f", -1), "radius"),
         (48 + 12, struct.pack("<f", float("inf")), "radius"), (48 + 16, struct.pack("<f", float("inf")), "spacing"),
         (48 + 16, struct.pack("<f", -0.5), "spacing"),
-        (48 + 20, struct.pack("<I", 0), "samples"), (48 + 20, struct.pack("<I", 65), "samples"),
+        (48 + 20, struct.pack("<I", 0), "samples"), (48 + 20, struct.pack("<I", 65536), "samples"),
         (48 + 24, struct.pack("<Q", 2**63), "subtree"), (48 + 24, struct.pack("<Q", 1), "subtree"),
         (48 + 32, struct.pack("<I", 15), "bytes"), (48 + 44, b"\x04", "children"),
         (48 + 44, b"\x00", "subtree"),

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lpc.errors import ScanError
+from lpc.errors import BuildError, ScanError
 from lpc.points import PointBatch
 from pointbuild.normals import OrientationField, block_normals, estimate
 from pointbuild.normals.blocks import Blocks, CoarseSample
@@ -64,7 +64,7 @@ def test_closed_shapes_in_blocks_point_outward(tmp_path, shape):
     assert np.median(cosines) > 0.999
     assert scan.info.samples_hint == len(xyz)
     assert scan.info.bounds_hint == (*xyz.min(0), *xyz.max(0))
-    assert [path.name for path in tmp_path.iterdir()] == ["normals"]
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["samples"]
 
 
 def test_the_normals_do_not_depend_on_batches_or_runs(tmp_path):
@@ -113,6 +113,14 @@ def test_records_that_are_not_finite_stay_in_the_count(tmp_path):
     assert not batch.normal[-30:].any()
     with pytest.raises(ScanError, match="finite"):
         estimate(Arrays(PointBatch(np.full((9, 3), np.nan))), tmp_path)
+
+
+def test_two_scans_in_one_scratch_and_too_little_memory(tmp_path):
+    one, two = (estimate(Arrays(PointBatch(shape(1000)[0])), tmp_path) for shape in (sphere, torus))
+    assert np.median(PointBatch.concatenate(one.batches(1000)).xyz[:, 0]) > 1e5
+    assert np.median(PointBatch.concatenate(two.batches(1000)).xyz[:, 0]) < 1e5
+    with pytest.raises(BuildError, match="--memory"):
+        estimate(Arrays(PointBatch(sphere(9)[0])), tmp_path, 64 << 20)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 17])

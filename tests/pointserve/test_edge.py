@@ -11,11 +11,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 import pytest
 from support.rawhttp import RawConnection, ask_once
 from support.servers import REPOSITORY, serve_in_thread
 from support.shelf import make_model
+
+from pointserve.guard import Guard, sign_address
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -141,23 +144,50 @@ def test_the_edge_never_joins_two_builds(tmp_path: Path, models: Path, model: Wr
 
 
 def test_the_edge_outlives_the_server(tmp_path: Path, models: Path, model: WriteModel) -> None:
-    data = model(size=300_000)
+    shelf = {name: model(name, size=300_000, seed=seed) for seed, name in enumerate(("david.lpc", "dawn.lpc"))}
 
-    async def ask(edge: str, until: str) -> None:
+    async def ask(edge: str, name: str, until: set[str]) -> None:
         async with asyncio.timeout(20), RawConnection(edge) as connection:
             state = None
-            while state != until:
-                reply = await connection.ask("/david.lpc", "Range: bytes=100-999")
-                assert reply.body == data[100:1000]
+            while state not in until:
+                reply = await connection.ask(f"/{name}", "Range: bytes=100-999")
+                assert reply.body == shelf[name][100:1000]
                 state = reply.headers["x-cache"]
-                await asyncio.sleep(0.1)
+                await asyncio.sleep(0.05)
 
     with ExitStack() as server_side, ExitStack() as edge_side:
         origin = server_side.enter_context(serve_in_thread(models, max_age=1))
         edge = edge_side.enter_context(edge_before(origin, tmp_path / "edge"))
-        asyncio.run(ask(edge, "REVALIDATED"))  # an old slice is asked for by its tag, and stays
+        asyncio.run(ask(edge, "dawn.lpc", {"MISS"}))
+        asyncio.run(ask(edge, "david.lpc", {"REVALIDATED"}))  # an old slice is asked for by its tag, and stays
         server_side.close()
-        asyncio.run(ask(edge, "STALE"))  # nobody to ask: better an old slice than none
+        asyncio.run(ask(edge, "dawn.lpc", {"STALE"}))  # nobody to ask: better an old slice than none
+
+
+def test_the_edge_keeps_nothing_that_only_some_may_read(tmp_path: Path, models: Path, model: WriteModel) -> None:
+    data = model(size=300_000)
+    token, key = b"a token of some length", b"a key of some length too"
+
+    async def run(origin: str, edge: str) -> None:
+        query = urlsplit(sign_address(f"{origin}/david.lpc", key, 4_000_000_000)).query
+        for target, *lines in (
+            ("/david.lpc", f"Authorization: Bearer {token.decode()}"),
+            (f"/david.lpc?{query}",),
+        ):
+            reply = await ask_once(edge, target, *lines, "Range: bytes=0-999")
+            assert reply.body == data[:1000]
+            assert (await ask_once(edge, "/david.lpc", "Range: bytes=0-999")).status == 401
+        assert (await ask_once(edge, "/metrics", f"Authorization: Bearer {token.decode()}")).status == 404
+
+    with (
+        serve_in_thread(models, guard=Guard(tokens=(token,), key=key)) as origin,
+        edge_before(origin, tmp_path / "edge") as edge,
+    ):
+        asyncio.run(run(origin, edge))
+    log = (tmp_path / "edge" / "access.log").read_text()
+    assert '"/david.lpc" 206 1000 range="bytes=0-999"' in log
+    assert "signature" not in log
+    assert token.decode() not in log
 
 
 def _digest(data: bytes) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -77,6 +78,14 @@ async def test_models_in_folders_and_behind_links_that_stay_inside(models: Path,
         (models / "switch").symlink_to("other.lpc")
         (models / "switch").rename(models / "inside.lpc")  # how a link is switched without a moment of absence
         assert (await connection.ask("/inside.lpc")).body == forest
+
+
+async def test_the_catalogue_lists_exactly_what_can_be_read(models: Path, forest: bytes) -> None:
+    async with serve_in_loop(models) as url, RawConnection(url) as connection:
+        listed = [entry["path"] for entry in json.loads((await connection.ask("/catalogue.json")).body)["models"]]
+        assert listed == ["/david.lpc", "/inside.lpc", "/sub/deep.lpc"]
+        for path in listed:
+            assert (await connection.ask(path, method="HEAD")).status == 200
 
 
 async def test_a_folder_exchanged_for_a_link_outside_is_noticed(tmp_path: Path, models: Path, forest: bytes) -> None:

@@ -3,67 +3,82 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from support import models
 
 from lpc.octahedral import decode_normals
+from pointview import splats
 from pointview.camera import Camera
 from pointview.refine import refine
-from pointview.render import Style, open_backend
+from pointview.render import Style, open_backend, shading
 from pointview.render.cpu import CpuBackend
-from pointview.render.picture import YELLOW, save_png, starved_pixels, tint_starved
-from pointview.splats import CLOSING, LARGEST, ROUND, ROUND_FROM
+from pointview.render.picture import YELLOW, save_png, tint_starved
 
 
 def camera_at(eye, *, target=(0.0, 0.0, 0.0), width=90, height=70):
     return Camera(eye=eye, target=target, up=(0, 0, 1), fov_y=45.0, width=width, height=height)
 
 
-def paint(model, cut, camera, *, cull):
-    """Depth and node of the nearest splat over every pixel centre, sample by sample in float64; and where two tie."""
+def paint(model, cut, camera, *, cull, oriented):
+    """Depth and node of the foremost splat at every pixel centre, sample by sample in float64; and where two tie."""
     depth = np.full((camera.height, camera.width), np.inf)
+    front = depth.copy()  # depth with the bulge
     node = np.full(depth.shape, -1)
     tied = np.zeros(depth.shape, dtype=bool)
     column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    ray = np.stack([(column - camera.width / 2), (camera.height / 2 - row)], axis=-1) / camera.focal
+    ray = np.concatenate([ray, np.ones((*depth.shape, 1))], axis=-1)
     for number, spacing in zip(cut.nodes.tolist(), cut.spacing.tolist(), strict=True):
         xyz = model.positions(number)
         pixel, z = camera.project(xyz)
-        normals = decode_normals(model.clouds[number].codes["normal"], 8) if cull else None
+        inside = camera.to_camera(xyz)
+        normals = decode_normals(model.clouds[number].codes["normal"], 8).astype(float)
         for i in range(len(xyz)):
-            if z[i] <= 0 or (normals is not None and normals[i] @ (xyz[i] - camera.eye) > 0):
+            if z[i] <= 0 or (cull and normals[i] @ (xyz[i] - camera.eye) > 0):
                 continue
-            side = min(CLOSING * spacing * camera.focal / z[i], LARGEST)
+            side = min(splats.CLOSING * spacing * camera.focal / z[i], splats.LARGEST)
             dx, dy = column - pixel[i, 0], row - pixel[i, 1]
+            here = behind = np.full(depth.shape, z[i])
             if side <= 1:
                 covered = (np.floor(column) == math.floor(pixel[i, 0])) & (np.floor(row) == math.floor(pixel[i, 1]))
-            elif side <= ROUND_FROM:
+            elif side <= splats.ROUND_FROM:
                 covered = (np.abs(dx) <= side / 2) & (np.abs(dy) <= side / 2)
             else:
-                covered = dx * dx + dy * dy <= (side * ROUND / 2) ** 2
-            nearer = covered & (z[i] < depth)
-            same = covered & (
-                np.isfinite(depth) & (np.abs(z[i] - np.where(np.isfinite(depth), depth, 0)) < 1e-5 * z[i])
-            )
+                radius = side * splats.ROUND / 2 * z[i] / camera.focal
+                if oriented:
+                    toward = -inside[i] / np.linalg.norm(inside[i])
+                    plane = camera.rotation() @ normals[i]
+                    plane *= np.sign(plane @ toward) / np.linalg.norm(plane)
+                    plane = plane + max(splats.STEEPEST - plane @ toward, 0) * toward
+                    here = (plane @ inside[i]) / (ray @ plane)
+                    apart = np.linalg.norm(here[..., None] * ray - inside[i], axis=-1)
+                else:
+                    apart = np.hypot(dx, dy) * z[i] / camera.focal
+                covered = (apart <= radius) & (here > 0)
+                behind = here + splats.BULGE * apart**2 / radius
+            nearer = covered & (behind < front)
             tied[nearer] = False
-            tied |= same
-            depth[nearer], node[nearer] = z[i], number
+            tied |= covered & (np.abs(behind - np.where(np.isfinite(front), front, -1)) < 1e-4 * behind)
+            front[nearer], depth[nearer], node[nearer] = behind[nearer], here[nearer], number
     return depth, node, tied
 
 
 @pytest.mark.parametrize(
     ("eye", "tolerance"), [((0, -3, 1), 1.0), ((0, -3, 1), 12.0), ((0.2, -12, 3), 1.0), ((0, -0.5, 0.1), 4.0)]
 )
-@pytest.mark.parametrize("cull", [True, False])
-def test_agrees_with_the_painter(eye, tolerance, cull):
+@pytest.mark.parametrize(("cull", "oriented"), [(True, True), (False, True), (False, False)])
+def test_agrees_with_the_painter(eye, tolerance, cull, oriented):
     model = models.sphere(1500, cloud_size=100)
     camera = camera_at(eye)
+    style = Style(two_sided=not cull, oriented=oriented, close_holes=False)
     cut = refine(model.index, camera, tolerance, model.everything, cull_backfaces=cull)
-    frame = CpuBackend(model.header).draw(cut, model.take, camera, Style(two_sided=not cull))
-    depth, node, tied = paint(model, cut, camera, cull=cull)
+    frame = CpuBackend(model.header).draw(cut, model.take, camera, style)
+    depth, node, tied = paint(model, cut, camera, cull=cull, oriented=oriented)
     different = np.isfinite(depth) != np.isfinite(frame.depth)
-    both = np.isfinite(depth) & np.isfinite(frame.depth)
+    both = np.isfinite(depth) & np.isfinite(frame.depth) & ~tied
     assert both.sum() > 100 or (cull and math.hypot(*eye) < 1)
     # A pixel centre on a splat's rim may fall either way in float32.
     assert different.mean() < 0.003
@@ -71,6 +86,34 @@ def test_agrees_with_the_painter(eye, tolerance, cull):
     assert (node != frame.node)[~tied].mean() < 0.003
     assert (frame.splats, frame.clouds) == (cut.splats, len(cut.nodes))
     assert (frame.rgb[frame.node < 0] == Style().background).all()
+
+
+def test_holes_are_closed_by_the_wall_around_them_and_nothing_else_is():
+    model = models.sphere(3000, cloud_size=100)
+    camera = camera_at((0, -3, 1), width=120, height=120)
+    cut = refine(model.index, camera, 1.0, model.everything)
+    cut = replace(cut, spacing=cut.spacing * 0.6)  # too small to close the surface
+    backend = CpuBackend(model.header)
+    before = backend.draw(cut, model.take, camera, Style(close_holes=False))
+    after = backend.draw(cut, model.take, camera, Style())
+    changed = np.argwhere((before.node != after.node) | (before.depth != after.depth))
+    assert len(changed) > 50
+    kept = np.ones(before.node.shape, dtype=bool)
+    kept[tuple(changed.T)] = False
+    np.testing.assert_array_equal(before.rgb[kept], after.rgb[kept])
+    side = splats.CLOSING * cut.spacing.max() * camera.focal / before.depth.min()
+    for row, column in changed:
+        walls, nearest = 0, []
+        for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
+            for step in range(1, math.ceil(splats.HOLE * side) + 1):
+                y, x = row + step * dy, column + step * dx
+                if 0 <= y < 120 and 0 <= x < 120 and before.depth[y, x] < before.depth[row, column]:
+                    walls += 1
+                    nearest.append(before.depth[y, x])
+                    break
+        assert walls >= splats.WALLS
+        assert after.depth[row, column] in nearest
+        assert after.depth[row, column] < before.depth[row, column]
 
 
 @pytest.mark.parametrize("normals", [True, False])
@@ -160,7 +203,9 @@ def test_inward_normals_show_nothing_one_sided_and_the_same_light_two_sided():
     cut = refine(outward.index, camera, 4.0, outward.everything, cull_backfaces=False)
     shown = CpuBackend(outward.header).draw(cut, outward.take, camera, Style(two_sided=True))
     turned = CpuBackend(inward.header).draw(cut, inward.take, camera, Style(two_sided=True))
-    np.testing.assert_array_equal(shown.depth, turned.depth)
+    np.testing.assert_array_equal(shown.node >= 0, turned.node >= 0)
+    seen = shown.node >= 0
+    assert (np.abs(shown.depth[seen] - turned.depth[seen]) > 1e-5 * shown.depth[seen]).mean() < 0.02
     assert (np.abs(shown.rgb.astype(int) - turned.rgb) > 2).mean() < 0.02
     one_sided = CpuBackend(inward.header).draw(cut, inward.take, camera, Style())
     nearest = CpuBackend(outward.header).draw(cut, outward.take, camera, Style())
@@ -183,18 +228,18 @@ def test_eye_dome_lighting_follows_its_formula():
     backend = CpuBackend(model.header)
     plain = backend.draw(cut, model.take, camera, Style(edl_strength=0.0)).rgb
     frame = backend.draw(cut, model.take, camera, Style(edl_strength=0.4))
-    for row in range(camera.height):
-        for column in range(camera.width):
-            if frame.node[row, column] < 0:
-                continue
-            here = float(frame.depth[row, column])
-            total = 0.0
-            for y in range(max(row - 1, 0), min(row + 2, camera.height)):
-                for x in range(max(column - 1, 0), min(column + 2, camera.width)):
-                    if frame.node[y, x] >= 0:
-                        total += max(0.0, math.log(here) - math.log(frame.depth[y, x]))
-            expected = plain[row, column] * math.exp(-0.4 * camera.focal * total / 8)
-            np.testing.assert_allclose(frame.rgb[row, column], expected, atol=1)
+    spacing = dict(zip(cut.nodes.tolist(), cut.spacing.tolist(), strict=True))
+    for row, column in np.argwhere(frame.node >= 0):
+        here = float(frame.depth[row, column])
+        side = splats.CLOSING * spacing[frame.node[row, column]] * camera.focal / here
+        away = max(int(shading.NEIGHBOUR * side + 0.5), 1)
+        total = 0.0
+        for y, x in ((row + i * away, column + j * away) for i in (-1, 0, 1) for j in (-1, 0, 1)):
+            if 0 <= y < 50 and 0 <= x < 60 and frame.node[y, x] >= 0:
+                total += max(0.0, math.log(here) - math.log(frame.depth[y, x]))
+        shade = math.exp(-0.4 * camera.focal * total / (8 * away))
+        expected = plain[row, column] * (shading.DARKEST + (1 - shading.DARKEST) * shade)
+        np.testing.assert_allclose(frame.rgb[row, column], expected, atol=1)
     assert frame.rgb[frame.node >= 0].mean() < plain[frame.node >= 0].mean()
 
 
@@ -205,7 +250,7 @@ def test_survey_coordinates_do_not_jitter(at):
     eye = (at[0], at[1] - 0.12, at[2])
     camera = camera_at(eye, target=at, width=200, height=200)
     cut = refine(model.index, camera, 1.0, model.everything, cull_backfaces=False)
-    frame = CpuBackend(model.header).draw(cut, model.take, camera, Style())
+    frame = CpuBackend(model.header).draw(cut, model.take, camera, Style(oriented=False))
     z = np.concatenate([camera.project(model.positions(node))[1] for node in cut.nodes.tolist()])
     drawn = np.unique(frame.depth[frame.node >= 0].astype(np.float64))
     nearest = np.abs(np.sort(z)[np.clip(np.searchsorted(np.sort(z), drawn), 1, len(z) - 1)] - drawn)
@@ -220,15 +265,15 @@ def test_starved_pixels_are_tinted(tmp_path):
     camera = camera_at((1, -2.5, 2), width=120, height=90)
     cut = refine(model.index, camera, 1.0, model.first(6))
     frame = CpuBackend(model.header).draw(cut, model.take, camera, Style())
-    where = starved_pixels(frame, cut)
+    where = frame.starved
     np.testing.assert_array_equal(where, np.isin(frame.node, cut.nodes[cut.starved]))
     assert where.any()
-    twin = tint_starved(frame, cut)
+    twin = tint_starved(frame)
     np.testing.assert_array_equal(twin[~where], frame.rgb[~where])
     np.testing.assert_allclose(twin[where], (frame.rgb[where] + np.array(YELLOW)) / 2, atol=0.51)
     full = refine(model.index, camera, 1.0, model.everything)
     whole = CpuBackend(model.header).draw(full, model.take, camera, Style())
-    assert not starved_pixels(whole, full).any()
+    assert not whole.starved.any()
     from PIL import Image
 
     save_png(twin, tmp_path / "twin.png")

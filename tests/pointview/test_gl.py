@@ -1,7 +1,7 @@
-"""OpenGL against the CPU backend: the same picture but for at most 0.5% of the covered pixels.
+"""OpenGL against the CPU backend: the same picture but for at most 0.1% of the covered pixels.
 
-Both project and cover in float32, so a sample on the border between two pixels, or two samples at the same depth,
-may fall either way; everything else is equal to 2 of 255 levels.
+Both project and cover in float32, so a pixel centre on the rim of a splat may fall either way; everything else is
+equal to 2 of 255 levels. Which of two samples at equal depth is seen may differ as well, in 2% of the pixels.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from pointview.render.cpu import CpuBackend
 
 moderngl = pytest.importorskip("moderngl")
 LEVELS = 2
-SHARE = 0.005
+SHARE = 0.001
+TIES = 0.02
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -51,10 +52,11 @@ def assert_same(frame, oracle, share=SHARE):
     difference = np.abs(frame.rgb.astype(int) - oracle.rgb).max(axis=2)
     assert (difference[covered] > LEVELS).mean() <= share
     assert difference[~covered].max(initial=0) == 0
-    assert (frame.node != oracle.node)[covered].mean() <= 4 * share  # quantised samples often tie in depth
+    assert (frame.node != oracle.node)[covered].mean() <= TIES
     both = np.isfinite(frame.depth) & np.isfinite(oracle.depth)
     expected = oracle.depth[both]
     assert (np.abs(frame.depth[both] - expected) > 1e-5 * expected).mean() <= share
+    assert (frame.starved != oracle.starved)[covered].mean() <= TIES
     assert (frame.splats, frame.clouds) == (oracle.splats, oracle.clouds)
 
 

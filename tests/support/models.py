@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from oracles import surfaces
 from oracles.build import build_bytes
 
-from lpc.cloud import Cloud
 from lpc.codec import decode_cloud
 from lpc.header import Header, parse_header
 from lpc.index import IndexTree
 from lpc.points import PointBatch
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from lpc.cloud import Cloud
 
 
 @dataclass
@@ -24,6 +28,9 @@ class Model:
     index: IndexTree
     clouds: list[Cloud]
     taken: list[int] = field(default_factory=list)
+
+    def __repr__(self) -> str:
+        return f"<Model of {self.header.samples} samples>"
 
     def take(self, node: int) -> Cloud:
         self.taken.append(node)

@@ -11,8 +11,9 @@ from __future__ import annotations
 import asyncio
 import base64
 import random
+from contextlib import aclosing
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import httpx
 
@@ -20,12 +21,13 @@ from lpc.errors import StoreError
 from lpc.ranges import ByteRange
 from pointstream.goodput import Goodput, Transfer
 
+from .base import KeepsNothing
 from .lanes import Lane, Lanes, plain_transports
 from .patience import PatienceOptions, Tries, overdue
 from .replies import Beyond, Moved, Part, Pins, Retry, Whole, judge, ranges_unsupported
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import AsyncGenerator, Callable
 
     from .base import Sink
 
@@ -50,12 +52,12 @@ class HttpOptions:
         Waiting and retrying.
     """
 
-    lanes: int = 6
+    lanes: int = 8
     headers: tuple[tuple[str, str], ...] = ()
     patience: PatienceOptions = field(default_factory=PatienceOptions)
 
 
-class HttpStore:
+class HttpStore(KeepsNothing):
     """A file at an http(s) address as a store.
 
     Parameters
@@ -97,7 +99,8 @@ class HttpStore:
         self._clock = clock
         self._rng = rng or random.Random(0)
         self._headers = [*headers, *self.options.headers]
-        self._lanes = Lanes(transports or plain_transports(address), self.options.lanes)
+        self._own_transports = transports is None
+        self._lanes = Lanes(transports or plain_transports(tls=self._url.scheme == "https"), self.options.lanes)
         self._pins = Pins()
         self._whole: bytes | None = None
         self._past_caches = False
@@ -145,6 +148,11 @@ class HttpStore:
         self._pins, self._whole, self.length = Pins(), None, None
         self._past_caches = True
         self._distrust_tags |= distrust_tags
+
+    def reject(self, place: ByteRange) -> None:
+        """Go past caches, and ask for a small file anew: one of them may have damaged it."""
+        del place
+        self._whole, self._past_caches = None, True
 
     async def close(self) -> None:
         """Close all connections."""
@@ -213,27 +221,27 @@ class HttpStore:
 
     async def _take_part(self, response: httpx.Response, part: Part, body: _Body, watch: _Watch, lane: Lane) -> None:
         offset = part.start
-        assert isinstance(response.stream, httpx.AsyncByteStream)
-        async for chunk in response.stream:
-            watch.count(len(chunk))
-            if offset + len(chunk) > part.stop:
-                raise Retry("more bytes than the reply's Content-Range says")
-            body.feed(offset, chunk)
-            offset += len(chunk)
-            if body.complete and part.stop - offset > DRAINED:
-                lane.spoiled = True
-                return
+        async with _chunks(response) as chunks:
+            async for chunk in chunks:
+                watch.count(len(chunk))
+                if offset + len(chunk) > part.stop:
+                    raise Retry("more bytes than the reply's Content-Range says")
+                body.feed(offset, chunk)
+                offset += len(chunk)
+                if body.complete and part.stop - offset > DRAINED:
+                    lane.spoiled = True
+                    return
         if offset < part.stop:
             raise Retry(f"the body ended {part.stop - offset} bytes early")
 
     async def _take_whole(self, response: httpx.Response, whole: Whole, watch: _Watch) -> None:
         data = bytearray()
-        assert isinstance(response.stream, httpx.AsyncByteStream)
-        async for chunk in response.stream:
-            watch.count(len(chunk))
-            data += chunk
-            if len(data) > whole.limit:
-                raise ranges_unsupported(self.host, whole.length)
+        async with _chunks(response) as chunks:
+            async for chunk in chunks:
+                watch.count(len(chunk))
+                data += chunk
+                if len(data) > whole.limit:
+                    raise ranges_unsupported(self.host, whole.length)
         if whole.length is not None and len(data) != whole.length:
             raise Retry(f"the body has {len(data)} bytes in place of {whole.length}")
         self._whole, self.length = bytes(data), len(data)
@@ -248,6 +256,8 @@ class HttpStore:
         here, there = (self._url.scheme, self._url.port), (target.scheme, target.port)
         if target.host != self._url.host or not (here == there or upgraded):
             raise StoreError(f"{self.name} redirects to {target}: open that address if you trust it")
+        if upgraded:  # connections made for plain text would not check certificates
+            self._lanes.renew(plain_transports(tls=True) if self._own_transports else None)
         self._url = target
 
 
@@ -315,6 +325,12 @@ class _Watch:
     def _postpone(self) -> None:
         rate = self._meter.rate(self._clock())
         self.limit.reschedule(overdue(self._sent, self.received, rate, self._patience))
+
+
+def _chunks(response: httpx.Response) -> aclosing[AsyncGenerator[bytes, None]]:
+    """Give the raw body, ended properly wherever the loop over it is left."""
+    assert isinstance(response.stream, httpx.AsyncByteStream)
+    return aclosing(cast("AsyncGenerator[bytes, None]", aiter(response.stream)))
 
 
 def _parse_address(address: str) -> tuple[httpx.URL, list[tuple[str, str]]]:

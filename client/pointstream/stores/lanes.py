@@ -21,9 +21,9 @@ KEEP_ALIVE = 4.0
 CLOSING_SECONDS = 2.0
 
 
-def plain_transports(address: str) -> Callable[[], httpx.AsyncBaseTransport]:
+def plain_transports(*, tls: bool) -> Callable[[], httpx.AsyncBaseTransport]:
     """Return what makes transports of one connection each; they share one TLS context, which is costly to make."""
-    context = httpx.create_ssl_context() if address.lower().startswith("https:") else False
+    context = httpx.create_ssl_context() if tls else False
     limits = httpx.Limits(max_connections=1, max_keepalive_connections=1, keepalive_expiry=KEEP_ALIVE)
     return lambda: httpx.AsyncHTTPTransport(verify=context, limits=limits)
 
@@ -67,10 +67,17 @@ class Lanes:
                 else:
                     self._idle.append(lane)
 
-    async def close(self) -> None:
-        """Close all lanes that are not lent, and wait for those that are being closed."""
+    def renew(self, factory: Callable[[], httpx.AsyncBaseTransport] | None) -> None:
+        """Use no lane of before again; make new ones by `factory`, if given."""
+        self._factory = factory or self._factory
+        for lane in self._busy:
+            lane.spoiled = True
         while self._idle:
             self._discard(self._idle.pop())
+
+    async def close(self) -> None:
+        """Close all lanes that are not lent, and wait for those that are being closed."""
+        self.renew(None)
         while self._closing:
             await asyncio.gather(*self._closing, return_exceptions=True)
 

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 
 from lpc.errors import ModelChanged, NotFound, StoreError, Unavailable
 
+from .base import KeepsNothing
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
     from .base import Sink
 
 
-class LocalStore:
+class LocalStore(KeepsNothing):
     """A file as a store; a file that is replaced by rename stays readable to its last byte.
 
     Raises

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from .base import KeepsNothing
+
 if TYPE_CHECKING:
     from lpc.ranges import ByteRange
     from pointstream.goodput import Goodput
@@ -11,7 +13,7 @@ if TYPE_CHECKING:
     from .base import Sink
 
 
-class MemoryStore:
+class MemoryStore(KeepsNothing):
     """Bytes as a store.
 
     Parameters

@@ -6,10 +6,13 @@ work of a frame is vectorised: a cut whose clouds are all here costs a few numpy
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
-from .pack import PackedCloud
+if TYPE_CHECKING:
+    from .pack import PackedCloud
 
 Slots = NDArray[np.int64]
 

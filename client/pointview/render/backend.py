@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from lpc.cloud import Cloud
     from pointview.camera import Camera
     from pointview.refine import Cut
@@ -32,6 +33,10 @@ class Style:
         Colour of models that carry none.
     two_sided : bool
         Light both sides of a surface and drop no sample that faces away: for normals that may point inward.
+    oriented : bool
+        Draw samples with normals as discs in their tangent plane; False: as discs that face the eye.
+    close_holes : bool
+        Paint pixels that a nearer surface encloses within a splat's width with that surface, see `splats`.
     edl_strength : float
         Eye-dome lighting of models without normals: slope that darkens by 1/e, see `shading`; 0 switches it off.
     """
@@ -39,7 +44,9 @@ class Style:
     background: Rgb = (18, 21, 26)
     surface: Rgb = (214, 208, 196)
     two_sided: bool = False
-    edl_strength: float = 0.35
+    oriented: bool = True
+    close_holes: bool = True
+    edl_strength: float = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,6 +60,8 @@ class Frame:
         Distance along the viewing direction, model units; infinite where nothing was drawn.
     node : (h, w) int32
         The node whose sample is seen; -1 where nothing was drawn.
+    starved : (h, w) bool
+        Pixels whose sample belongs to a starved node: the yellow patches of LPC figure 5.
     splats, clouds : int
         Samples and clouds submitted.
     uploads : int
@@ -62,9 +71,17 @@ class Frame:
     rgb: NDArray[np.uint8]
     depth: NDArray[np.float32]
     node: NDArray[np.int32]
+    starved: NDArray[np.bool_]
     splats: int
     clouds: int
     uploads: int
+
+
+def starved_pixels(node: NDArray[np.int32], cut: Cut) -> NDArray[np.bool_]:
+    """Which pixels of a `Frame.node` show a starved node of the cut it was drawn from."""
+    starved = np.zeros(int(cut.nodes[-1]) + 2 if len(cut.nodes) else 1, dtype=bool)
+    starved[cut.nodes] = cut.starved
+    return starved[node]  # -1 is the last entry, false
 
 
 class Backend(Protocol):

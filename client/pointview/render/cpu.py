@@ -5,46 +5,30 @@ The default where there is no graphics hardware, the renderer of batch pictures,
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pointview.splats import CLOSING, LARGEST, ROUND, ROUND_FROM
+from pointview import splats
 
-from . import kernels
+from . import kernels, shading
 from .arena import Arena
-from .backend import Frame, Style, Take
+from .backend import Frame, Style, Take, starved_pixels
 from .pack import Packer
-from .shading import RADIUS, lamp
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
     from lpc.header import Header
     from pointview.camera import Camera
     from pointview.refine import Cut
 
 FIRST_SAMPLES = 1 << 21
 """Room at the start, samples."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Draw:
-    """The arrays of one frame, a row for each cloud."""
-
-    nodes: NDArray[np.int64]
-    first: NDArray[np.int64]
-    count: NDArray[np.int64]
-    place: NDArray[np.int64]
-    offset: NDArray[np.float32]
-    scale: NDArray[np.float32]
-    size: NDArray[np.float32]
-
-    def every(self, step: int, first: int) -> _Draw:
-        """Every `step`-th cloud: neighbours in the array are neighbours in space and cost alike."""
-        return _Draw(*(np.ascontiguousarray(getattr(self, item.name)[first::step]) for item in fields(self)))
 
 
 class CpuBackend:
@@ -71,24 +55,62 @@ class CpuBackend:
     def draw(self, cut: Cut, take: Take, camera: Camera, style: Style) -> Frame:
         """Draw a cut."""
         uploads = self._upload(cut.nodes, take)
-        draw = self._arrays(cut, camera)
         shape = (camera.height, camera.width)
         if self._layers.shape[1:] != shape:
             self._layers = np.empty((self._threads, *shape), dtype=np.uint64)
+        clouds, cloud_of_block = self._clouds(cut, camera)
+        view = self._view(cut, camera, style)
+        light = self._light(camera, style)
         rotation = camera.rotation().astype(np.float32)
-        near, _ = cut.depth_range
+        rgb, depth = np.empty((*shape, 3), dtype=np.uint8), np.empty(shape, dtype=np.float32)
+        node, side = np.empty(shape, dtype=np.int32), np.empty(shape, dtype=np.float32)
+        source = np.empty(shape, dtype=np.int32)
+        surface = (255, 255, 255) if self._packer.has_colors else style.surface
+        albedo = np.array(surface, dtype=np.float32) / np.float32(255)
+        background = np.array(style.background, dtype=np.uint8)
 
         def splat(worker: int) -> None:
-            mine = draw.every(self._threads, worker)
             self._layers[worker] = kernels.EMPTY
-            kernels.splat(
-                self._layers[worker], self._vertex, mine.first, mine.count, mine.place, mine.offset, mine.scale,
-                mine.size, rotation, camera.focal, near, LARGEST, ROUND_FROM, ROUND,
-                self._packer.has_normals and not style.two_sided,
+            # Every `threads`-th cloud: neighbours in the array are neighbours in space, and cost alike.
+            mine = np.ascontiguousarray(clouds[worker :: self._threads])
+            kernels.splat(self._layers[worker], self._vertex, mine, rotation, view)
+
+        def rows(worker: int) -> tuple[int, int]:
+            return camera.height * worker // self._threads, camera.height * (worker + 1) // self._threads
+
+        def resolve(worker: int) -> None:
+            kernels.resolve(
+                self._layers, *rows(worker), rgb, depth, node, side, self._vertex, self._color, clouds, cloud_of_block,
+                rotation, view, light, albedo, background,
             )  # fmt: skip
 
+        def dim(worker: int) -> None:
+            strength = style.edl_strength * camera.focal
+            kernels.eye_dome(rgb, depth, side, *rows(worker), strength, shading.NEIGHBOUR, shading.DARKEST)
+
+        def close(worker: int) -> None:
+            largest = min(splats.LARGEST_HOLE, math.ceil(splats.HOLE * side.max()))
+            kernels.close_holes(depth, side, source, *rows(worker), camera.focal, splats.HOLE, largest, splats.WALLS)
+
         self._in_parallel(splat)
-        return self._resolve(draw, camera, style, rotation, uploads)
+        self._in_parallel(resolve)
+        if style.close_holes:
+            self._in_parallel(close)
+            holes = np.flatnonzero(source != np.arange(source.size, dtype=np.int32).reshape(shape))
+            walls = source.ravel()[holes]
+            for image in (rgb.reshape(-1, 3), depth.ravel(), node.ravel(), side.ravel()):
+                image[holes] = image[walls]
+        if not self._packer.has_normals and style.edl_strength > 0:
+            self._in_parallel(dim)
+        return Frame(
+            rgb=rgb,
+            depth=depth,
+            node=node,
+            starved=starved_pixels(node, cut),
+            splats=cut.splats,
+            clouds=len(cut.nodes),
+            uploads=uploads,
+        )
 
     def close(self) -> None:
         """Stop the threads."""
@@ -113,50 +135,38 @@ class CpuBackend:
             self._arena.put(slot, packed)
         return len(absent)
 
-    def _arrays(self, cut: Cut, camera: Camera) -> _Draw:
+    def _clouds(self, cut: Cut, camera: Camera) -> tuple[NDArray[Any], NDArray[np.int32]]:
+        """Return the clouds of the frame, and the cloud that each block of places belongs to."""
         slots = self._arena.slots_of(cut.nodes)
-        count = self._arena.count[slots]
-        blocks = np.cumsum((count >> kernels.BLOCK_BITS) + 1)
-        return _Draw(
-            nodes=cut.nodes,
-            first=slots * self._samples,
-            count=count,
-            place=np.concatenate([[0], blocks[:-1]]).astype(np.int64) << kernels.BLOCK_BITS,
-            offset=(self._arena.origin[slots] - np.array(camera.eye)).astype(np.float32),
-            scale=self._arena.scale[slots].astype(np.float32),
-            size=(cut.spacing * (CLOSING * camera.focal)).astype(np.float32),
-        )
+        blocks = (self._arena.count[slots] >> kernels.BLOCK_BITS) + 1
+        clouds = np.empty(len(slots), dtype=kernels.CLOUD)
+        clouds["node"] = cut.nodes
+        clouds["first"] = slots * self._samples
+        clouds["count"] = self._arena.count[slots]
+        clouds["place"] = (np.cumsum(blocks) - blocks) << kernels.BLOCK_BITS
+        offset = self._arena.origin[slots] - np.array(camera.eye)
+        clouds["x"], clouds["y"], clouds["z"] = offset.T
+        clouds["scale"] = self._arena.scale[slots]
+        clouds["side"] = cut.spacing * (splats.CLOSING * camera.focal)
+        return clouds, np.repeat(np.arange(len(slots), dtype=np.int32), blocks)
 
-    def _resolve(self, draw: _Draw, camera: Camera, style: Style, rotation: NDArray[np.float32], uploads: int) -> Frame:
-        shape = (camera.height, camera.width)
-        rgb = np.empty((*shape, 3), dtype=np.uint8)
-        depth = np.empty(shape, dtype=np.float32)
-        node = np.empty(shape, dtype=np.int32)
-        lit = self._packer.has_normals
-        surface = (255, 255, 255) if self._packer.has_colors else style.surface
-        albedo = np.array(surface, dtype=np.float32) / np.float32(255)
-        background = np.array(style.background, dtype=np.uint8)
-        cloud_of_block = np.repeat(np.arange(len(draw.nodes), dtype=np.int32), (draw.count >> kernels.BLOCK_BITS) + 1)
+    def _view(self, cut: Cut, camera: Camera, style: Style) -> Any:
+        view = np.zeros(1, dtype=kernels.VIEW)[0]
+        view["width"], view["height"], view["focal"] = camera.width, camera.height, camera.focal
+        view["near"] = cut.depth_range[0]
+        view["largest"], view["round_from"], view["round"] = splats.LARGEST, splats.ROUND_FROM, splats.ROUND
+        view["bulge"], view["steepest"] = splats.BULGE, splats.STEEPEST
+        view["cull"] = self._packer.has_normals and not style.two_sided
+        view["oriented"] = style.oriented
+        return view
 
-        dims = not lit and style.edl_strength > 0
-        factor = style.edl_strength * camera.focal / (8 * RADIUS)
-
-        def rows(worker: int) -> tuple[int, int]:
-            return camera.height * worker // self._threads, camera.height * (worker + 1) // self._threads
-
-        def resolve(worker: int) -> None:
-            kernels.resolve(
-                self._layers, *rows(worker), rgb, depth, node, self._vertex, self._color, cloud_of_block, draw.place,
-                draw.first, draw.nodes, draw.offset, draw.scale, rotation, albedo, background, lamp(), lit,
-                style.two_sided,
-            )  # fmt: skip
-
-        self._in_parallel(resolve)
-        if dims:
-            self._in_parallel(lambda worker: kernels.eye_dome(rgb, depth, *rows(worker), factor))
-        return Frame(
-            rgb=rgb, depth=depth, node=node, splats=int(draw.count.sum()), clouds=len(draw.nodes), uploads=uploads
-        )
+    def _light(self, camera: Camera, style: Style) -> Any:
+        light = np.zeros(1, dtype=kernels.LIGHT)[0]
+        for name in ("ambient", "diffuse", "specular", "shininess", "unlit"):
+            light[name] = getattr(shading, name.upper())
+        light["lamp_x"], light["lamp_y"], light["lamp_z"] = shading.lamp() @ camera.rotation()
+        light["lit"], light["two_sided"] = self._packer.has_normals, style.two_sided
+        return light
 
     def _in_parallel(self, work: Callable[[int], None]) -> None:
         """Call `work(worker)` once for every worker; the first on this thread."""

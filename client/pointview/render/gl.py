@@ -11,22 +11,24 @@ A GL context belongs to the thread that made it: open, draw and close on one thr
 from __future__ import annotations
 
 import math
+import re
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 import moderngl
 import numpy as np
-from numpy.typing import NDArray
 
 from lpc.errors import Unavailable
-from pointview.splats import CLOSING, LARGEST, ROUND, ROUND_FROM
+from pointview import splats
 
 from . import shading
 from .arena import Arena
-from .backend import Frame, Style, Take
+from .backend import Frame, Style, Take, starved_pixels
 from .pack import SAMPLE_BYTES, Packer
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from lpc.header import Header
     from pointview.camera import Camera
     from pointview.refine import Cut
@@ -74,8 +76,8 @@ class GlBackend:
         except moderngl.Error as error:
             self._context.release()
             raise Unavailable(f"OpenGL ({self.renderer}) failed: {_one_line(error)}; use --backend cpu") from error
-        self._largest = min(LARGEST, (float(self._context.info["GL_POINT_SIZE_RANGE"][1]) - 2.0) / ROUND)
-        self._margin = math.ceil(self._largest * ROUND / 2) + 1
+        self._largest = min(splats.LARGEST, float(self._context.info["GL_POINT_SIZE_RANGE"][1]) / 1.5)
+        self._margin = math.ceil(self._largest)
 
     @property
     def name(self) -> str:
@@ -84,26 +86,21 @@ class GlBackend:
 
     def draw(self, cut: Cut, take: Take, camera: Camera, style: Style) -> Frame:
         """Draw a cut."""
-        context = self._context
         self._resize(camera.width, camera.height)
-        self._target.use()
         self._clear(style)
-        # OpenGL drops a point whose centre is outside the viewport, even if its splat reaches in.
-        margin = self._margin
-        self._target.viewport = (-margin, -margin, camera.width + 2 * margin, camera.height + 2 * margin)
-        context.enable_only(moderngl.DEPTH_TEST | moderngl.PROGRAM_POINT_SIZE)
-        context.depth_func = "<"
-        self._set_uniforms(camera, style, cut.depth_range)
-        uploads = splats = 0
+        self._begin_splats(cut, camera, style)
+        uploads = 0
         for start in range(0, len(cut.nodes), self._arena.slots):
             part = slice(start, start + self._arena.slots)
             uploads += self._upload(cut.nodes[part], take)
-            splats += self._submit(cut.nodes[part], cut.spacing[part], camera)
-        source = self._target
+            self._submit(cut.nodes[part], cut.spacing[part], camera)
+        layers = self._splatted
+        if style.close_holes:
+            layers = self._close_holes(layers, camera)
+        picture = layers.target
         if not self._packer.has_normals and style.edl_strength > 0:
-            self._eye_dome(camera, style)
-            source = self._dimmed
-        return self._read(source, camera, splats=splats, clouds=len(cut.nodes), uploads=uploads)
+            picture = self._eye_dome(layers, camera, style)
+        return self._read(picture, layers, camera, cut, uploads)
 
     def close(self) -> None:
         """Release the context and all that it holds."""
@@ -123,10 +120,12 @@ class GlBackend:
             self._commands = context.buffer(reserve=slots * COMMAND.itemsize)
             content.append((self._placements, "3f 2f 1i /i", "offset", "placement", "node"))
         self._points = context.vertex_array(self._program, content)
-        self._dimmer = context.program(
-            vertex_shader=_shader("eye_dome.vert.glsl"), fragment_shader=_shader("eye_dome.frag.glsl")
+        self._closer, self._dimmer = (
+            context.program(vertex_shader=_shader("picture.vert.glsl"), fragment_shader=_shader(name))
+            for name in ("close_holes.frag.glsl", "eye_dome.frag.glsl")
         )
-        self._triangle = context.vertex_array(self._dimmer, [])
+        self._closing = context.vertex_array(self._closer, [])
+        self._dimming = context.vertex_array(self._dimmer, [])
         self._size = (0, 0)
 
     def _resize(self, width: int, height: int) -> None:
@@ -134,12 +133,9 @@ class GlBackend:
             return
         context, size = self._context, (width, height)
         try:
-            self._color_image = context.texture(size, 4)
-            self._depth_image = context.texture(size, 1, dtype="f4")
-            self._node_image = context.texture(size, 1, dtype="i4")
-            self._target = context.framebuffer(
-                [self._color_image, self._depth_image, self._node_image], context.depth_texture(size)
-            )
+            depth_buffer = context.depth_texture(size)
+            self._splatted = _Layers(context, size, depth_buffer)
+            self._closed = _Layers(context, size)
             self._dimmed = context.framebuffer([context.texture(size, 4)])
         except moderngl.Error as error:
             raise Unavailable(f"OpenGL cannot draw {width}x{height} pixels: {_one_line(error)}") from error
@@ -147,11 +143,37 @@ class GlBackend:
 
     def _clear(self, style: Style) -> None:
         red, green, blue = (channel / 255 for channel in style.background)
-        self._target.clear(red, green, blue, 1.0, depth=1.0)
-        # moderngl clears all attachments to one colour.
-        height, width = self._size[1], self._size[0]
-        self._depth_image.write(np.full((height, width), EMPTY, dtype="<f4"))
-        self._node_image.write(np.full((height, width), -1, dtype="<i4"))
+        self._splatted.target.clear(red, green, blue, 1.0, depth=1.0)
+        self._splatted.only_depth.clear(EMPTY, 0.0)  # moderngl clears all attachments of a target to one colour
+
+    def _begin_splats(self, cut: Cut, camera: Camera, style: Style) -> None:
+        target, margin = self._splatted.target, self._margin
+        target.use()
+        # OpenGL drops a point whose centre is outside the viewport, even if its splat reaches in.
+        target.viewport = (-margin, -margin, camera.width + 2 * margin, camera.height + 2 * margin)
+        self._context.enable_only(moderngl.DEPTH_TEST | moderngl.PROGRAM_POINT_SIZE)
+        self._context.depth_func = "<"
+        near, far = cut.depth_range
+        surface = (255, 255, 255) if self._packer.has_colors else style.surface
+        values: dict[str, Any] = {
+            "rotation": tuple(camera.rotation().T.ravel()),  # column by column
+            "size": (camera.width, camera.height),
+            "margin": margin,
+            "focal": camera.focal,
+            "range": (near, 2 * far),  # the rim of a disc is behind its centre
+            "largest": self._largest,
+            "round_from": splats.ROUND_FROM,
+            "round_factor": splats.ROUND,
+            "bulge": splats.BULGE,
+            "steepest": splats.STEEPEST,
+            "oriented": style.oriented,
+            "albedo": tuple(channel / 255 for channel in surface),
+            "lamp": tuple(shading.lamp().tolist()),
+            "lit": self._packer.has_normals,
+            "two_sided": style.two_sided,
+        }
+        for name, value in values.items():
+            self._program[name].value = value
 
     def _upload(self, nodes: NDArray[np.int64], take: Take) -> int:
         absent, slots = self._arena.place(nodes)
@@ -166,14 +188,14 @@ class GlBackend:
             self._arena.put(slot, packed)
         return len(absent)
 
-    def _submit(self, nodes: NDArray[np.int64], spacing: NDArray[np.float32], camera: Camera) -> int:
-        """Draw nodes that are in the arena; return their number of samples."""
+    def _submit(self, nodes: NDArray[np.int64], spacing: NDArray[np.float32], camera: Camera) -> None:
+        """Draw nodes that are in the arena."""
         slots = self._arena.slots_of(nodes)
         counts = self._arena.count[slots]
         placement = np.empty(len(nodes), dtype=PLACEMENT)
         placement["offset"] = self._arena.origin[slots] - np.array(camera.eye)
         placement["placement"][:, 0] = self._arena.scale[slots]
-        placement["placement"][:, 1] = spacing * (CLOSING * camera.focal)
+        placement["placement"][:, 1] = spacing * (splats.CLOSING * camera.focal)
         placement["node"] = nodes
         first = slots * self._samples
         if self._one_draw:
@@ -183,7 +205,7 @@ class GlBackend:
             self._placements.write(placement)
             self._commands.write(commands)
             self._points.render_indirect(self._commands, moderngl.POINTS, len(nodes))
-            return int(counts.sum())
+            return
         offset, scale, node = (self._program[name] for name in ("offset", "placement", "node"))
         rows = zip(placement, counts.tolist(), first.tolist(), strict=True)
         for row, count, start in rows:
@@ -191,50 +213,59 @@ class GlBackend:
             scale.write(row["placement"].tobytes())
             node.write(row["node"].tobytes())
             self._points.render(moderngl.POINTS, vertices=count, first=start)
-        return int(counts.sum())
 
-    def _set_uniforms(self, camera: Camera, style: Style, depth_range: tuple[float, float]) -> None:
-        surface = (255, 255, 255) if self._packer.has_colors else style.surface
-        values: dict[str, Any] = {
-            "rotation": tuple(camera.rotation().T.ravel()),  # column by column
-            "size": (camera.width, camera.height),
-            "margin": self._margin,
-            "focal": camera.focal,
-            "range": depth_range,
-            "largest": self._largest,
-            "round_from": ROUND_FROM,
-            "round_factor": ROUND,
-            "albedo": tuple(channel / 255 for channel in surface),
-            "lamp": tuple(shading.lamp().tolist()),
-            "lit": self._packer.has_normals,
-            "two_sided": style.two_sided,
-        }
-        for name, value in values.items():
-            self._program[name].value = value
+    def _close_holes(self, layers: _Layers, camera: Camera) -> _Layers:
+        self._closed.target.use()
+        self._context.enable_only(moderngl.NOTHING)
+        for unit, (name, image) in enumerate(layers.images.items()):
+            image.use(unit)
+            self._closer[name].value = unit
+        self._closer["focal"].value = camera.focal
+        self._closing.render(moderngl.TRIANGLES, vertices=3)
+        return self._closed
 
-    def _eye_dome(self, camera: Camera, style: Style) -> None:
+    def _eye_dome(self, layers: _Layers, camera: Camera, style: Style) -> Any:
         self._dimmed.use()
         self._context.enable_only(moderngl.NOTHING)
-        self._color_image.use(0)
-        self._depth_image.use(1)
-        self._dimmer["picture"].value = 0
-        self._dimmer["depths"].value = 1
-        self._dimmer["factor"].value = style.edl_strength * camera.focal / (8 * shading.RADIUS)
-        self._triangle.render(moderngl.TRIANGLES, vertices=3)
+        for unit, name in enumerate(("picture", "depths")):
+            layers.images[name].use(unit)
+            self._dimmer[name].value = unit
+        self._dimmer["strength"].value = style.edl_strength * camera.focal
+        self._dimming.render(moderngl.TRIANGLES, vertices=3)
+        return self._dimmed
 
-    def _read(self, source: Any, camera: Camera, *, splats: int, clouds: int, uploads: int) -> Frame:
-        shape = (camera.height, camera.width)
-        rgba = np.frombuffer(source.read(components=4), dtype=np.uint8).reshape(*shape, 4)
-        depth = np.frombuffer(self._target.read(components=1, attachment=1, dtype="f4"), dtype="<f4").reshape(shape)
-        node = np.frombuffer(self._target.read(components=1, attachment=2, dtype="i4"), dtype="<i4").reshape(shape)
+    def _read(self, picture: Any, layers: _Layers, camera: Camera, cut: Cut, uploads: int) -> Frame:
+        shape, viewport = (camera.height, camera.width), (0, 0, camera.width, camera.height)
+        rgba = np.frombuffer(picture.read(viewport, components=4), dtype=np.uint8).reshape(*shape, 4)
+        read = layers.target.read
+        depth = np.frombuffer(read(viewport, components=1, attachment=1, dtype="f4"), dtype="<f4").reshape(shape)[::-1]
+        node = np.frombuffer(read(viewport, components=1, attachment=2, dtype="i4"), dtype="<i4").reshape(shape)[::-1]
+        empty = depth >= EMPTY
+        node = np.where(empty, np.int32(-1), node)
         return Frame(
             rgb=np.ascontiguousarray(rgba[::-1, :, :3]),
-            depth=np.where(depth[::-1] >= EMPTY, np.float32(np.inf), depth[::-1]),
-            node=np.ascontiguousarray(node[::-1]),
-            splats=splats,
-            clouds=clouds,
+            depth=np.where(empty, np.float32(np.inf), depth),
+            node=node,
+            starved=starved_pixels(node, cut),
+            splats=cut.splats,
+            clouds=len(cut.nodes),
             uploads=uploads,
         )
+
+
+class _Layers:
+    """What a frame consists of before it is a picture: images of colour, of depth and side, of nodes."""
+
+    def __init__(self, context: Any, size: tuple[int, int], depth_buffer: Any = None) -> None:
+        self.images = {
+            "picture": context.texture(size, 4),
+            "depths": context.texture(size, 2, dtype="f4"),
+            "nodes": context.texture(size, 1, dtype="i4"),
+        }
+        for image in self.images.values():
+            image.filter = (moderngl.NEAREST, moderngl.NEAREST)  # others make an integer texture unreadable
+        self.target = context.framebuffer(list(self.images.values()), depth_buffer)
+        self.only_depth = context.framebuffer([self.images["depths"]])
 
 
 def _context() -> Any:
@@ -250,11 +281,15 @@ def _context() -> Any:
 
 
 def _shader(name: str, defines: str = "") -> str:
+    """Text of a shader: GLSL with the constants of `splats` and `shading` for @NAME@."""
     text = (files(__package__) / "shaders" / name).read_text(encoding="utf-8")
-    for constant in ("AMBIENT", "DIFFUSE", "SPECULAR", "SHININESS", "UNLIT"):
-        text = text.replace(f"@{constant}@", f"{float(getattr(shading, constant))}")
-    text = text.replace("@RADIUS@", str(shading.RADIUS)).replace("@EMPTY@", f"{EMPTY:.9e}")
-    return f"#version 330\n{defines}{text}"
+    kinds = "".join(f"#define {kind} {number}\n" for number, kind in enumerate(("POINT", "SQUARE", "BALL", "DISC")))
+
+    def constant(match: re.Match[str]) -> str:
+        value = EMPTY if match[1] == "EMPTY" else getattr(shading, match[1], None) or getattr(splats, match[1])
+        return str(value) if match[1] in ("WALLS", "LARGEST_HOLE") else f"{float(value):.9e}"
+
+    return f"#version 330\n{defines}{kinds}{re.sub('@([A-Z_]+)@', constant, text)}"
 
 
 def _one_line(error: BaseException) -> str:

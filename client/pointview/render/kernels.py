@@ -1,26 +1,88 @@
-"""Compiled loops of the CPU backend. All of them in this module: the cache of compiled code does not see other files.
+"""Compiled loops of the CPU backend.
+
+All of them are in this module, and the constants of `splats` and `shading` come as arguments: the cache of compiled
+code does not see other files.
 
 A picture is made in two steps. `splat` keeps, for each pixel, the smallest of the 64-bit keys `depth << 32 | place`:
 the bits of a positive float32 are ordered like its value, and the place (a running number of the sample within the
 frame) decides ties, so the picture depends neither on the order of work nor on the number of threads. `resolve` then
 looks up, once per pixel and not once per splat, which sample is seen, and lights it.
+
+Names: (x, y, z) is a sample relative to the eye, axes of model space; (right, up, depth) the same in camera space.
 """
 
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING, Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from .shading import AMBIENT, DIFFUSE, RADIUS, SHININESS, SPECULAR, UNLIT
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 EMPTY = np.uint64(0xFFFFFFFFFFFFFFFF)
 BLOCK_BITS = 8
 """Places are given out in blocks of 256, so that a table of blocks finds the cloud of a place."""
 
+CLOUD = np.dtype(
+    [
+        ("node", np.int32),
+        ("first", np.int64),  # row of its first sample
+        ("count", np.int64),
+        ("place", np.int64),  # of its first sample
+        ("x", np.float32),  # position of the cloud's (0, 0, 0) relative to the eye
+        ("y", np.float32),
+        ("z", np.float32),
+        ("scale", np.float32),  # model units of a step
+        ("side", np.float32),  # of a splat, pixels times depth
+    ]
+)
+"""A cloud of the frame."""
+
+VIEW = np.dtype(
+    [
+        ("width", np.float32),
+        ("height", np.float32),
+        ("focal", np.float32),
+        ("near", np.float32),
+        ("largest", np.float32),  # side of a splat, pixels; see `splats` for this and the next four
+        ("round_from", np.float32),
+        ("round", np.float32),
+        ("bulge", np.float32),
+        ("steepest", np.float32),
+        ("cull", np.bool_),  # drop samples whose normal points away
+        ("oriented", np.bool_),  # samples with normals are discs in their tangent plane
+    ]
+)
+"""What all splats of a frame share."""
+
+LIGHT = np.dtype(
+    [
+        ("ambient", np.float32),  # see `shading`
+        ("diffuse", np.float32),
+        ("specular", np.float32),
+        ("shininess", np.float32),
+        ("unlit", np.float32),
+        ("lamp_x", np.float32),  # unit vector, axes of model space
+        ("lamp_y", np.float32),
+        ("lamp_z", np.float32),
+        ("lit", np.bool_),
+        ("two_sided", np.bool_),
+    ]
+)
+"""How samples are lit."""
+
+DIRECTIONS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1))
+"""Of the eight neighbours; opposite ones first, which decide soonest."""
+
 F = np.float32
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
+def _key(depth: np.float32, place: int) -> np.uint64:  # pragma: no cover - compiled
+    return (np.uint64(F(depth).view(np.uint32)) << np.uint64(32)) | np.uint64(place)
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
@@ -37,22 +99,102 @@ def _octahedral(code: int) -> tuple[np.float32, np.float32, np.float32]:  # prag
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def _plane(
+    code: int, right: np.float32, up: np.float32, depth: np.float32, rotation: NDArray[np.float32], steepest: np.float32
+) -> tuple[np.float32, np.float32, np.float32]:  # pragma: no cover - compiled
+    """Return a disc's normal in camera space: toward the eye, and seen no more from the side than `steepest`."""
+    a, b, c = _octahedral(code)
+    nx = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c
+    ny = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c
+    nz = rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c
+    away = F(1.0) / math.sqrt(right * right + up * up + depth * depth)
+    vx, vy, vz = right * away, up * away, depth * away
+    length = F(1.0) / math.sqrt(nx * nx + ny * ny + nz * nz)
+    facing = -(nx * vx + ny * vy + nz * vz) * length
+    if facing < F(0.0):
+        length, facing = -length, -facing
+    lean = max(steepest - facing, F(0.0))
+    nx, ny, nz = nx * length - lean * vx, ny * length - lean * vy, nz * length - lean * vz
+    length = F(1.0) / math.sqrt(nx * nx + ny * ny + nz * nz)
+    return F(nx * length), F(ny * length), F(nz * length)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _disc(
+    keys: NDArray[np.uint64],
+    place: int,
+    right: np.float32,
+    up: np.float32,
+    depth: np.float32,
+    radius: np.float32,
+    normal: tuple[np.float32, np.float32, np.float32],
+    view: Any,
+) -> None:  # pragma: no cover - compiled
+    """Draw a disc in the plane of its normal, exactly: each pixel's ray meets the plane inside the radius, or not."""
+    nx, ny, nz = normal
+    middle_x, middle_y, focal = view.width * F(0.5), view.height * F(0.5), view.focal
+    slope_x, slope_y = right / depth, up / depth
+    # Bounds of the disc's picture: right to first order in radius over depth, and no less.
+    across = radius * focal / depth / (F(1.0) - min(radius / depth, F(0.5)))
+    half_x = across * math.sqrt(max(F(1.0) + slope_x * slope_x - (nx - slope_x * nz) ** 2, F(0.0)))
+    half_y = across * math.sqrt(max(F(1.0) + slope_y * slope_y - (ny - slope_y * nz) ** 2, F(0.0)))
+    px, py = middle_x + slope_x * focal, middle_y - slope_y * focal
+    left = max(math.ceil(px - half_x - F(0.5)), 0)
+    end = min(math.ceil(px + half_x - F(0.5)), int(view.width))
+    top = max(math.ceil(py - half_y - F(0.5)), 0)
+    bottom = min(math.ceil(py + half_y - F(0.5)), int(view.height))
+    reach, inverse = radius * radius, F(1.0) / focal
+    bulge = view.bulge / radius
+    along = nx * right + ny * up + nz * depth
+    for row in range(top, bottom):
+        ray_y = (middle_y - F(row) - F(0.5)) * inverse
+        part = ny * ray_y + nz
+        for column in range(left, end):
+            ray_x = (F(column) + F(0.5) - middle_x) * inverse
+            t = along / (nx * ray_x + part)
+            dx, dy, dz = t * ray_x - right, t * ray_y - up, t - depth
+            apart = dx * dx + dy * dy + dz * dz
+            if apart <= reach and t > F(0.0):
+                key = _key(t + bulge * apart, place)
+                if key < keys[row, column]:
+                    keys[row, column] = key
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _ball(
+    keys: NDArray[np.uint64],
+    place: int,
+    px: np.float32,
+    py: np.float32,
+    depth: np.float32,
+    half: np.float32,
+    view: Any,
+) -> None:  # pragma: no cover - compiled
+    """Draw a disc that faces the eye and bulges toward it, so that of two the one with the nearer centre is seen."""
+    left = max(math.ceil(px - half - F(0.5)), 0)
+    end = min(math.ceil(px + half - F(0.5)), int(view.width))
+    top = max(math.ceil(py - half - F(0.5)), 0)
+    bottom = min(math.ceil(py + half - F(0.5)), int(view.height))
+    reach = half * half
+    bulge = view.bulge * depth / (view.focal * half)
+    for row in range(top, bottom):
+        dy = F(row) + F(0.5) - py
+        for column in range(left, end):
+            dx = F(column) + F(0.5) - px
+            apart = dx * dx + dy * dy
+            if apart <= reach:
+                key = _key(depth + bulge * apart, place)
+                if key < keys[row, column]:
+                    keys[row, column] = key
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def splat(
     keys: NDArray[np.uint64],
     vertex: NDArray[np.uint16],
-    first: NDArray[np.int64],
-    count: NDArray[np.int64],
-    place: NDArray[np.int64],
-    offset: NDArray[np.float32],
-    scale: NDArray[np.float32],
-    size: NDArray[np.float32],
+    clouds: NDArray[Any],
     rotation: NDArray[np.float32],
-    focal: float,
-    near: float,
-    largest: float,
-    round_from: float,
-    round_factor: float,
-    cull: bool,
+    view: Any,
 ) -> None:  # pragma: no cover - compiled
     """Keep the nearest sample of each pixel.
 
@@ -62,74 +204,64 @@ def splat(
         EMPTY, or what earlier calls left.
     vertex : (n, 4) uint16
         x, y, z, normal.
-    first, count, place : (clouds,) int64
-        Rows of `vertex`, and the place of the cloud's first sample.
-    offset : (clouds, 3) float32
-        Position of the cloud's (0, 0, 0) relative to the eye, axes of model space.
-    scale : (clouds,) float32
-        Model units of a step.
-    size : (clouds,) float32
-        Side of a splat, pixels times depth.
-    cull : bool
-        Drop samples whose normal points away from the eye.
+    clouds : (k,) CLOUD
+    rotation : (3, 3) float32
+        Model space to camera space.
+    view : VIEW
     """
-    height, width = keys.shape
-    middle_x, middle_y = F(width * 0.5), F(height * 0.5)
-    focal32, near32, largest32 = F(focal), F(near), F(largest)
-    round_from32, round_half = F(round_from), F(round_factor * 0.5)
-    r00, r01, r02 = rotation[0, 0] * focal32, rotation[0, 1] * focal32, rotation[0, 2] * focal32
-    r10, r11, r12 = rotation[1, 0] * focal32, rotation[1, 1] * focal32, rotation[1, 2] * focal32
+    width, height = view.width, view.height
+    middle_x, middle_y, focal = width * F(0.5), height * F(0.5), view.focal
+    near, largest, round_from, round_half = view.near, view.largest, view.round_from, view.round * F(0.5)
+    r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
+    r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
     r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
-    for c in range(len(first)):
-        ox, oy, oz, s = offset[c, 0], offset[c, 1], offset[c, 2], scale[c]
-        side_at_1 = size[c]
-        start = first[c]
-        for i in range(start, start + count[c]):
-            x = ox + s * F(vertex[i, 0])
-            y = oy + s * F(vertex[i, 1])
-            z = oz + s * F(vertex[i, 2])
+    for c in range(len(clouds)):
+        cloud = clouds[c]
+        ox, oy, oz, scale, side_at_1 = cloud.x, cloud.y, cloud.z, cloud.scale, cloud.side
+        start, place = cloud.first, cloud.place
+        for i in range(start, start + cloud.count):
+            x = ox + scale * F(vertex[i, 0])
+            y = oy + scale * F(vertex[i, 1])
+            z = oz + scale * F(vertex[i, 2])
             depth = r20 * x + r21 * y + r22 * z
-            if not depth > near32:
+            if not depth > near:
                 continue
-            if cull:
+            if view.cull:
                 code = int(vertex[i, 3])
                 if code != 0:
                     nx, ny, nz = _octahedral(code)
                     if nx * x + ny * y + nz * z > F(0.0):
                         continue
             inverse = F(1.0) / depth
-            px = middle_x + (r00 * x + r01 * y + r02 * z) * inverse
-            py = middle_y - (r10 * x + r11 * y + r12 * z) * inverse
-            side = min(side_at_1 * inverse, largest32)
-            key = (np.uint64(F(depth).view(np.uint32)) << np.uint64(32)) | np.uint64(place[c] + (i - start))
+            right = r00 * x + r01 * y + r02 * z
+            up = r10 * x + r11 * y + r12 * z
+            px = middle_x + focal * right * inverse
+            py = middle_y - focal * up * inverse
+            side = min(side_at_1 * inverse, largest)
+            half = side * (round_half if side > round_from else F(0.5))
+            if not (px + half >= F(0.0) and py + half >= F(0.0) and px - half < width and py - half < height):
+                continue
             if side <= F(1.0):
-                if px >= F(0.0) and py >= F(0.0) and px < F(width) and py < F(height):
-                    column, row = int(px), int(py)
-                    if key < keys[row, column]:
-                        keys[row, column] = key
-                continue
-            round_splat = side > round_from32
-            half = side * (round_half if round_splat else F(0.5))
-            if not (px + half > F(0.0) and py + half > F(0.0) and px - half < F(width) and py - half < F(height)):
-                continue
-            # Pixels whose centres lie in [p - half, p + half).
-            left = max(math.ceil(px - half - F(0.5)), 0)
-            right = min(math.ceil(px + half - F(0.5)), width)
-            top = max(math.ceil(py - half - F(0.5)), 0)
-            bottom = min(math.ceil(py + half - F(0.5)), height)
-            if round_splat:
-                reach = half * half
+                if px >= F(0.0) and py >= F(0.0) and px < width and py < height:
+                    key = _key(depth, place + (i - start))
+                    if key < keys[int(py), int(px)]:
+                        keys[int(py), int(px)] = key
+            elif side <= round_from:
+                # Pixels whose centres lie in [p - half, p + half).
+                key = _key(depth, place + (i - start))
+                left = max(math.ceil(px - half - F(0.5)), 0)
+                end = min(math.ceil(px + half - F(0.5)), int(width))
+                top = max(math.ceil(py - half - F(0.5)), 0)
+                bottom = min(math.ceil(py + half - F(0.5)), int(height))
                 for row in range(top, bottom):
-                    dy = F(row) + F(0.5) - py
-                    for column in range(left, right):
-                        dx = F(column) + F(0.5) - px
-                        if dx * dx + dy * dy <= reach and key < keys[row, column]:
-                            keys[row, column] = key
-            else:
-                for row in range(top, bottom):
-                    for column in range(left, right):
+                    for column in range(left, end):
                         if key < keys[row, column]:
                             keys[row, column] = key
+            elif view.oriented and vertex[i, 3] != 0:
+                normal = _plane(int(vertex[i, 3]), right, up, depth, rotation, view.steepest)
+                _disc(keys, place + (i - start), right, up, depth, half * depth / focal, normal, view)
+            else:
+                _ball(keys, place + (i - start), px, py, depth, half, view)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -140,23 +272,20 @@ def resolve(
     rgb: NDArray[np.uint8],
     depth: NDArray[np.float32],
     node: NDArray[np.int32],
+    side: NDArray[np.float32],
     vertex: NDArray[np.uint16],
     color: NDArray[np.uint8],
+    clouds: NDArray[Any],
     cloud_of_block: NDArray[np.int32],
-    place: NDArray[np.int64],
-    first: NDArray[np.int64],
-    nodes: NDArray[np.int64],
-    offset: NDArray[np.float32],
-    scale: NDArray[np.float32],
     rotation: NDArray[np.float32],
+    view: Any,
+    light: Any,
     albedo: NDArray[np.float32],
     background: NDArray[np.uint8],
-    lamp: NDArray[np.float32],
-    lit: bool,
-    two_sided: bool,
 ) -> None:  # pragma: no cover - compiled
-    """Colour, depth and node of the rows `top` to `bottom` from the key images (threads, h, w)."""
+    """Colour, depth, node and side of the splat of the rows `top` to `bottom` from the key images (threads, h, w)."""
     threads, _, width = layers.shape
+    middle_x, middle_y, focal = view.width * F(0.5), view.height * F(0.5), view.focal
     for row in range(top, bottom):
         for column in range(width):
             key = layers[0, row, column]
@@ -165,67 +294,79 @@ def resolve(
                 if other < key:
                     key = other
             if key == EMPTY:
-                depth[row, column] = np.inf
-                node[row, column] = -1
+                depth[row, column], node[row, column], side[row, column] = np.inf, -1, 0.0
                 for channel in range(3):
                     rgb[row, column, channel] = background[channel]
                 continue
-            bits = np.uint32(key >> np.uint64(32))
-            depth[row, column] = np.uint32(bits).view(np.float32)
-            sample_place = np.int64(key & np.uint64(0xFFFFFFFF))
-            cloud = cloud_of_block[sample_place >> BLOCK_BITS]
-            node[row, column] = nodes[cloud]
-            i = first[cloud] + sample_place - place[cloud]
-            light, shine = F(1.0), F(0.0)
-            if lit:
-                s = scale[cloud]
-                x = offset[cloud, 0] + s * F(vertex[i, 0])
-                y = offset[cloud, 1] + s * F(vertex[i, 1])
-                z = offset[cloud, 2] + s * F(vertex[i, 2])
-                light, shine = _light(int(vertex[i, 3]), x, y, z, rotation, lamp, two_sided)
+            place = np.int64(key & np.uint64(0xFFFFFFFF))
+            cloud = clouds[cloud_of_block[place >> BLOCK_BITS]]
+            i = cloud.first + place - cloud.place
+            code = int(vertex[i, 3])
+            x = cloud.x + cloud.scale * F(vertex[i, 0])
+            y = cloud.y + cloud.scale * F(vertex[i, 1])
+            z = cloud.z + cloud.scale * F(vertex[i, 2])
+            here = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
+            across = min(cloud.side / here, view.largest)
+            if across > view.round_from and view.oriented and code != 0:
+                right = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
+                up = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
+                nx, ny, nz = _plane(code, right, up, here, rotation, view.steepest)
+                ray_x, ray_y = (F(column) + F(0.5) - middle_x) / focal, (middle_y - F(row) - F(0.5)) / focal
+                here = (nx * right + ny * up + nz * here) / (nx * ray_x + ny * ray_y + nz)
+            depth[row, column], node[row, column], side[row, column] = here, cloud.node, across
+            bright, shine = F(1.0), F(0.0)
+            if light.lit:
+                bright, shine = _lit(code, x, y, z, light)
             for channel in range(3):
-                value = F(color[i, channel]) * albedo[channel] * light + F(255.0) * shine
+                value = F(color[i, channel]) * albedo[channel] * bright + F(255.0) * shine
                 rgb[row, column, channel] = np.uint8(min(value + F(0.5), F(255.0)))
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def _light(
-    code: int,
-    x: np.float32,
-    y: np.float32,
-    z: np.float32,
-    rotation: NDArray[np.float32],
-    lamp: NDArray[np.float32],
-    two_sided: bool,
+def _lit(
+    code: int, x: np.float32, y: np.float32, z: np.float32, light: Any
 ) -> tuple[np.float32, np.float32]:  # pragma: no cover - compiled
-    """Factor of the albedo and highlight of a sample at (x, y, z) from the eye (see `shading`)."""
+    """Factor of the albedo and highlight of a sample (see `shading`)."""
     if code == 0:
-        return F(UNLIT), F(0.0)
+        return light.unlit, F(0.0)
     a, b, c = _octahedral(code)
     length = F(1.0) / math.sqrt(a * a + b * b + c * c)
     a, b, c = a * length, b * length, c * length
     length = F(-1.0) / math.sqrt(x * x + y * y + z * z)
     x, y, z = x * length, y * length, z * length
     toward_eye = a * x + b * y + c * z
-    if two_sided and toward_eye < F(0.0):
+    if light.two_sided and toward_eye < F(0.0):
         a, b, c, toward_eye = -a, -b, -c, -toward_eye
-    # The lamp in model space.
-    lx = rotation[0, 0] * lamp[0] + rotation[1, 0] * lamp[1] + rotation[2, 0] * lamp[2]
-    ly = rotation[0, 1] * lamp[0] + rotation[1, 1] * lamp[1] + rotation[2, 1] * lamp[2]
-    lz = rotation[0, 2] * lamp[0] + rotation[1, 2] * lamp[1] + rotation[2, 2] * lamp[2]
-    toward = a * lx + b * ly + c * lz
+    toward = a * light.lamp_x + b * light.lamp_y + c * light.lamp_z
     if toward <= F(0.0):
-        return F(AMBIENT), F(0.0)
-    mirror = F(2.0) * toward * toward_eye - (lx * x + ly * y + lz * z)
-    shine = F(0.0) if mirror <= F(0.0) else F(SPECULAR) * mirror**SHININESS
-    return F(AMBIENT) + F(DIFFUSE) * toward, F(shine)
+        return light.ambient, F(0.0)
+    mirror = F(2.0) * toward * toward_eye - (light.lamp_x * x + light.lamp_y * y + light.lamp_z * z)
+    shine = F(0.0) if mirror <= F(0.0) else light.specular * mirror**light.shininess
+    return light.ambient + light.diffuse * toward, F(shine)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def eye_dome(
-    rgb: NDArray[np.uint8], depth: NDArray[np.float32], top: int, bottom: int, factor: float
+    rgb: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    side: NDArray[np.float32],
+    top: int,
+    bottom: int,
+    strength: float,
+    sides: float,
+    darkest: float,
 ) -> None:  # pragma: no cover - compiled
-    """Darken `rgb` in place by eye-dome lighting; `factor` is strength * focal / (8 RADIUS)."""
+    """Darken `rgb` in place by eye-dome lighting (see `shading`).
+
+    Parameters
+    ----------
+    strength : float
+        `Style.edl_strength` times the focal length, pixels.
+    sides : float
+        Distance of the neighbours, sides of the pixel's splat.
+    darkest : float
+        Least factor.
+    """
     height, width = depth.shape
     for row in range(top, bottom):
         for column in range(width):
@@ -233,13 +374,72 @@ def eye_dome(
             if here == np.inf:
                 continue
             inverse = F(1.0) / here
+            away = max(int(side[row, column] * F(sides) + F(0.5)), 1)
             # The sum of logarithms is the logarithm of a product: one call for eight neighbours.
             product = F(1.0)
-            for y in range(max(row - RADIUS, 0), min(row + RADIUS + 1, height), RADIUS):
-                for x in range(max(column - RADIUS, 0), min(column + RADIUS + 1, width), RADIUS):
+            for i in range(-1, 2):
+                y = row + i * away
+                if y < 0 or y >= height:
+                    continue
+                for j in range(-1, 2):
+                    x = column + j * away
+                    if x < 0 or x >= width or (i == 0 and j == 0):
+                        continue
                     ratio = depth[y, x] * inverse
                     if ratio < F(1.0):
                         product *= max(ratio, F(1e-4))
-            shade = F(math.exp(factor * math.log(product)))
+            shade = F(darkest + (1.0 - darkest) * math.exp(strength / (8.0 * away) * math.log(product)))
             for channel in range(3):
                 rgb[row, column, channel] = np.uint8(F(rgb[row, column, channel]) * shade + F(0.5))
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def close_holes(
+    depth: NDArray[np.float32],
+    side: NDArray[np.float32],
+    source: NDArray[np.int32],
+    top: int,
+    bottom: int,
+    focal: float,
+    reach: float,
+    largest: int,
+    walls: int,
+) -> None:  # pragma: no cover - compiled
+    """Say for each pixel of the rows `top` to `bottom` which pixel it shows: itself, or the wall of the hole it is in.
+
+    Parameters
+    ----------
+    depth, side : (h, w) float32
+    source : (h, w) int32
+        Result: row * width + column.
+    reach : float
+        A wall is at most this many sides of its own splat away.
+    largest : int
+        And at most this many pixels.
+    walls : int
+        Directions, of eight, in which a hole has walls.
+    """
+    height, width = depth.shape
+    for row in range(top, bottom):
+        for column in range(width):
+            here = depth[row, column]
+            best, nearest, found = row * width + column, largest + 1, 0
+            for direction in range(8):
+                if found + 8 - direction < walls:
+                    break
+                dx, dy = DIRECTIONS[direction]
+                step = 1
+                while step <= largest:
+                    x, y = column + step * dx, row + step * dy
+                    if x < 0 or x >= width or y < 0 or y >= height:
+                        break
+                    wall = depth[y, x]
+                    if wall < here:
+                        wide = side[y, x]
+                        if step <= max(F(reach) * wide, F(1.0)) and wall * (F(1.0) + wide / F(focal)) < here:
+                            found += 1
+                            if step < nearest:
+                                nearest, best = step, y * width + x
+                            break
+                    step += 1 if step < 4 else step // 2
+            source[row, column] = best if found >= walls else row * width + column

@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lpc.errors import StoreError
 
 if TYPE_CHECKING:
-    from pointview.refine import Cut
+    from pathlib import Path
 
-    from .backend import Frame
+    from numpy.typing import NDArray
+
+
+class Shown(Protocol):
+    """A picture (h, w, 3) uint8 and its starved pixels (h, w) bool; a `Frame` is one."""
+
+    @property
+    def rgb(self) -> NDArray[np.uint8]:
+        """Colours."""
+        ...
+
+    @property
+    def starved(self) -> NDArray[np.bool_]:
+        """Pixels of starved nodes."""
+        ...
+
 
 YELLOW = (255, 214, 10)
 TINT = 0.5
@@ -36,18 +49,8 @@ def save_png(rgb: NDArray[np.uint8], path: Path) -> None:
         raise StoreError(f"cannot write {path}: {error.strerror or error}") from error
 
 
-def starved_pixels(frame: Frame, cut: Cut) -> NDArray[np.bool_]:
-    """Pixels (h, w) whose sample belongs to a starved node: the yellow patches of LPC figure 5."""
-    starved = cut.nodes[cut.starved]
-    if len(starved) == 0:
-        return np.zeros(frame.node.shape, dtype=bool)
-    place = np.minimum(np.searchsorted(starved, frame.node), len(starved) - 1)
-    return starved[place] == frame.node
-
-
-def tint_starved(frame: Frame, cut: Cut) -> NDArray[np.uint8]:
+def tint_starved(frame: Shown) -> NDArray[np.uint8]:
     """Return the picture with its starved pixels tinted yellow."""
     rgb = frame.rgb.copy()
-    where = starved_pixels(frame, cut)
-    rgb[where] = np.rint(rgb[where] * (1 - TINT) + np.array(YELLOW) * TINT).astype(np.uint8)
+    rgb[frame.starved] = np.rint(rgb[frame.starved] * (1 - TINT) + np.array(YELLOW) * TINT).astype(np.uint8)
     return rgb

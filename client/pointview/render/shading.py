@@ -8,21 +8,26 @@ With normals: a lamp above the eye's left shoulder, ambient, diffuse and a soft 
     rgb          albedo * (AMBIENT + DIFFUSE * d) + SPECULAR * h
 
 Without normals: eye-dome lighting (Boucheny 2009), from depth z alone. A pixel is darkened by how much nearer its eight
-neighbours at RADIUS pixels are; empty neighbours count as equally far:
+neighbours at a distance of m pixels are; empty neighbours count as equally far:
 
-    s            focal * mean over neighbours q of max(0, ln z(p) - ln z(q)) / RADIUS
-    rgb          albedo * exp(-strength * s)
+    m            NEIGHBOUR times the side of the pixel's splat, rounded, at least 1
+    s            focal * mean over neighbours q of max(0, ln z(p) - ln z(q)) / m
+    rgb          albedo * (DARKEST + (1 - DARKEST) * exp(-strength * s))
 
-`focal / RADIUS` turns the step of ln z into the tangent of the surface's slope, so the look depends neither on the
-resolution of the picture nor on the distance to the model.
+`focal / m` turns the step of ln z into the tangent of the surface's slope, so the look depends neither on the
+resolution of the picture nor on the distance to the model; and neighbours one splat away see the slope, not the rim of
+the splat they all lie in.
 """
 
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 LAMP = (-0.35, 0.55, 1.0)
 """Direction to the lamp in camera space: right, up, toward the eye; normalised by `lamp`."""
@@ -34,8 +39,12 @@ SHININESS = 16
 UNLIT = 0.80
 """Factor of the albedo for the samples without normal of a model that has normals."""
 
-RADIUS = 1
-"""Distance of the neighbours of eye-dome lighting, pixels."""
+NEIGHBOUR = 0.4
+"""Distance of the neighbours of eye-dome lighting, sides of a splat: about the spacing of its samples."""
+
+
+DARKEST = 0.25
+"""What eye-dome lighting leaves of a pixel at an edge; without it foliage is all outlines."""
 
 
 def lamp() -> NDArray[np.float32]:

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from lpc.errors import ScanError
 
 from .kernels import add_polygons
-from .scan import unit
+from .scan import finite_rows, unit
+
+_SLICE = 1 << 18
 
 
 class VertexNormals:
@@ -30,17 +32,19 @@ class VertexNormals:
     def __init__(self, batches: Iterable[NDArray[np.float64]]) -> None:
         origin: NDArray[np.float64] | None = None
         parts: list[NDArray[np.float32]] = []
+        reach = float(np.finfo(np.float32).tiny)
         for xyz in batches:
-            if origin is None and np.isfinite(xyz).all(axis=1).any():
-                origin = xyz[np.isfinite(xyz).all(axis=1)][0]
+            good = xyz[finite_rows(xyz)]
+            if origin is None and len(good):
+                origin = good[0]
             # Relative to one of them, float32 keeps the shape of a mesh that stands millions of units off.
+            relative = xyz - (0.0 if origin is None else origin)
+            reach = max(reach, float(np.max(np.abs(relative[np.isfinite(relative)]), initial=0.0)))
             with np.errstate(over="ignore"):
-                parts.append((xyz - (0.0 if origin is None else origin)).astype(np.float32))
+                parts.append(relative.astype(np.float32))
         self._xyz = np.concatenate(parts) if parts else np.empty((0, 3), np.float32)
-        reach = float(
-            np.max(np.abs(self._xyz, where=np.isfinite(self._xyz), out=np.zeros_like(self._xyz)), initial=0.0)
-        )
-        self._xyz /= max(reach, float(np.finfo(np.float32).tiny))  # area vectors of tiny meshes must not underflow
+        self._xyz /= np.float32(reach)  # area vectors of tiny meshes must not underflow
+        parts.clear()
         self._sums = np.zeros_like(self._xyz)
 
     def add(self, counts: NDArray[np.int64], indices: NDArray[Any]) -> None:
@@ -59,6 +63,7 @@ class VertexNormals:
 
     def finish(self) -> NDArray[np.float32]:
         """Return unit normals (n, 3), zero for vertices of no face; the positions are let go."""
-        normals = unit(self._sums)
-        self._xyz = self._sums = np.empty((0, 3), np.float32)
+        normals, self._xyz, self._sums = self._sums, np.empty((0, 3), np.float32), np.empty((0, 3), np.float32)
+        for start in range(0, len(normals), _SLICE):
+            normals[start : start + _SLICE] = unit(normals[start : start + _SLICE])
         return normals

@@ -1,4 +1,4 @@
-// One sample of a cloud: dequantised relative to the eye, projected, lit.
+// One sample of a cloud: dequantised relative to the eye, projected, lit, and given its shape (see splats.py).
 //
 // COMMANDS: the cloud's parameters arrive as per-instance attributes, chosen by the base instance of an indirect
 // command. Without it they are uniforms, and every cloud is a draw of its own (OpenGL 3.3 to 4.2).
@@ -21,18 +21,23 @@ uniform vec2 size;         // of the picture, pixels
 uniform float margin;      // of the viewport around the picture, pixels
 uniform float focal;
 uniform vec2 range;        // nearest and farthest depth
-uniform float largest;     // side of a splat, pixels
+uniform float largest;
 uniform float round_from;
 uniform float round_factor;
+uniform float steepest;
+uniform bool oriented;
 uniform vec3 albedo;
-uniform vec3 lamp;
+uniform vec3 lamp;         // camera space
 uniform bool lit;
 uniform bool two_sided;
 
 flat out vec3 rgb;
-flat out vec2 middle;      // of the splat, window coordinates, y up
-flat out vec2 reach;       // half a side; 1 if round
-flat out float depth;
+flat out vec3 center;      // camera space
+flat out vec2 middle;      // the same on the picture, pixels, y up
+flat out vec3 plane;       // normal of a disc's plane
+flat out float extent;     // half a side, pixels; of a disc its radius, model units
+flat out float side;
+flat out int kind;
 flat out int seen;
 
 const float AMBIENT = @AMBIENT@;
@@ -50,10 +55,9 @@ vec3 octahedral(float code) {
     return vec3(uv, w);
 }
 
-// Factor of the albedo and highlight: see shading.py. `p` is the sample in camera space.
-vec2 light(vec3 normal, vec3 p) {
-    vec3 n = normalize(rotation * normal);
-    vec3 v = -normalize(p);
+// Factor of the albedo and highlight: see shading.py.
+vec2 light(vec3 n) {
+    vec3 v = -normalize(center);
     if (two_sided && dot(n, v) < 0.0)
         n = -n;
     float toward = dot(n, lamp);
@@ -63,6 +67,17 @@ vec2 light(vec3 normal, vec3 p) {
     return vec2(AMBIENT + DIFFUSE * toward, mirror <= 0.0 ? 0.0 : SPECULAR * pow(mirror, SHININESS));
 }
 
+// Toward the eye, and seen no more from the side than `steepest`.
+vec3 disc_plane(vec3 n) {
+    vec3 away = normalize(center);
+    float facing = -dot(n, away);
+    if (facing < 0.0) {
+        n = -n;
+        facing = -facing;
+    }
+    return normalize(n - max(steepest - facing, 0.0) * away);
+}
+
 void drop() {
     gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
     gl_PointSize = 1.0;
@@ -70,38 +85,43 @@ void drop() {
 
 void main() {
     vec3 q = offset + placement.x * vertex.xyz;
-    vec3 p = rotation * q;
-    depth = p.z;
+    center = rotation * q;
+    float depth = center.z;
     if (!(depth > range.x)) {
         drop();
         return;
     }
-    vec2 shade = vec2(1.0, 0.0);
-    if (lit) {
-        shade = vec2(UNLIT, 0.0);
-        if (vertex.w > 0.0) {
-            vec3 normal = octahedral(vertex.w);
-            if (!two_sided && dot(normal, q) > 0.0) {
-                drop();
-                return;
-            }
-            shade = light(normal, p);
-        }
+    bool has_normal = vertex.w > 0.0;
+    vec3 normal = octahedral(vertex.w);
+    if (lit && has_normal && !two_sided && dot(normal, q) > 0.0) {
+        drop();
+        return;
     }
+    normal = normalize(rotation * normal);
+    vec2 shade = lit ? (has_normal ? light(normal) : vec2(UNLIT, 0.0)) : vec2(1.0, 0.0);
     rgb = min(color.rgb * albedo * shade.x + shade.y, 1.0);
     seen = node;
-    middle = 0.5 * size + p.xy * (focal / depth);
-    float side = min(placement.y / depth, largest);
-    bool is_round = side > round_from;
-    reach = vec2(0.5 * side * (is_round ? round_factor : 1.0), is_round ? 1.0 : 0.0);
+    middle = 0.5 * size + center.xy * (focal / depth);
+    side = min(placement.y / depth, largest);
+    extent = 0.5 * side * (side > round_from ? round_factor : 1.0);
+    gl_PointSize = ceil(2.0 * extent) + 1.0;
+    plane = vec3(0.0);
     if (side <= 1.0) {
-        reach.x = 0.0;
+        kind = POINT;
         gl_PointSize = 1.0;
+    } else if (side <= round_from) {
+        kind = SQUARE;
+    } else if (oriented && has_normal) {
+        kind = DISC;
+        plane = disc_plane(normal);
+        vec2 slope = center.xy / depth;
+        vec2 lean = plane.xy - slope * plane.z;
+        vec2 half_size = extent * sqrt(max(1.0 + slope * slope - lean * lean, 0.0));
+        extent *= depth / focal;
+        half_size /= 1.0 - min(extent / depth, 0.5);
+        gl_PointSize = ceil(2.0 * max(half_size.x, half_size.y)) + 1.0;
     } else {
-        gl_PointSize = ceil(2.0 * reach.x) + 1.0;
+        kind = BALL;
     }
-    // A point is drawn without interpolation, so any increasing function of the depth will do: the logarithm keeps the
-    // same relative precision everywhere.
-    float z = log(depth / range.x) / log(range.y / range.x);
-    gl_Position = vec4(2.0 * (middle + margin) / (size + 2.0 * margin) - 1.0, 2.0 * z - 1.0, 1.0);
+    gl_Position = vec4(2.0 * (middle + margin) / (size + 2.0 * margin) - 1.0, 0.0, 1.0);
 }

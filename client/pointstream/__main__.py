@@ -1,0 +1,5 @@
+"""``python -m pointstream`` is the command."""
+
+from .command import main
+
+main()

@@ -1,0 +1,300 @@
+"""Offline copies: all of a model, or what a region of it needs, checked, resumable at any moment.
+
+The copy is filled as a cache is (stores/cached.py), and all that holds for the cache holds for it: only bytes that
+passed their checks are written, a killed process loses at most the last mebibyte, what is there is not fetched again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import zlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote, urlsplit
+
+import numpy as np
+
+from lpc.errors import Corrupt, FormatError, StoreError, Unavailable
+from lpc.header import HEADER_PROBE, Header, compute_digest, parse_header
+from lpc.page import PAGE_HEADER
+
+from .reading import EVERYTHING, Reader, ReadingOptions, Region
+from .stores.cached import CachedStore
+from .stores.sparse import SparseFile, map_path
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from .stores import Store
+
+RUN = 1 << 16
+"""Bytes of a request: what an interruption may cost, a few times."""
+WAITING = 1 << 20
+"""Bytes on their way to the disk before more are asked for."""
+FIRST_PAUSE, LONGEST_PAUSE = 1.0, 10.0
+"""Seconds between two tries while the host does not answer; they double."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FetchOptions:
+    """What to copy.
+
+    Parameters
+    ----------
+    region : Region
+    most_bytes : int, optional
+        Bytes of the copy, at most; the coarsest clouds of the region come first.
+    patience : float
+        Seconds to wait for a host that gives nothing.
+    """
+
+    region: Region = EVERYTHING
+    most_bytes: int | None = None
+    patience: float = 60.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FetchReport:
+    """What the copy holds now.
+
+    Parameters
+    ----------
+    path : str
+    clouds, clouds_total : int
+        In the copy, and in the model.
+    bytes, bytes_total : int
+        Likewise.
+    bytes_fetched : int
+        Those of them that came in this run.
+    complete : bool
+        The copy is the model, byte for byte.
+    problems : tuple of str
+        Clouds that stayed damaged.
+    """
+
+    path: str
+    clouds: int
+    clouds_total: int
+    bytes: int
+    bytes_total: int
+    bytes_fetched: int
+    complete: bool
+    problems: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Give what ``pointstream fetch --json`` prints."""
+        return {name: getattr(self, name) for name in self.__slots__} | {"problems": list(self.problems)}
+
+
+class Copy:
+    """The one file that is filled: what a cache is to `CachedStore`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    def last_build(self, address: str) -> str | None:
+        """Build id of what is there already."""
+        del address
+        header = self._header()
+        return None if header is None else header.digest
+
+    def remember(self, address: str, digest: str) -> None:
+        """Do nothing: the file itself says what it is."""
+
+    def find(self, address: str, digest: str) -> Path | None:
+        """Return the file, if it is there."""
+        del address, digest
+        return self.path if self.path.is_file() else None
+
+    def open(self, address: str, header: Header) -> SparseFile:
+        """Open the file to be filled.
+
+        Raises
+        ------
+        StoreError
+            If something else stands in its place.
+        """
+        del address
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        there = self._header()
+        if there is not None and there.digest != header.digest:
+            raise StoreError(f"{self.path} holds another build of the model: move it away, or name another folder")
+        if there is None and self.path.exists() and not map_path(self.path).is_file():
+            raise StoreError(f"{self.path} is something else: move it away, or name another folder")
+        return SparseFile(self.path, length=header.bytes, tag=header.tag)
+
+    def room(self, keep: Path) -> int:
+        """No bound but the disk's."""
+        del keep
+        return 1 << 62
+
+    def clear(self, entry: Path) -> bool:
+        """Throw nothing of a person's away."""
+        del entry
+        return False
+
+    def _header(self) -> Header | None:
+        try:
+            with self.path.open("rb") as file:
+                return parse_header(file.read(HEADER_PROBE))
+        except (OSError, FormatError):
+            return None
+
+
+def copy_name(target: str) -> str:
+    """Return the file name for a copy of a path or address."""
+    name = unquote(urlsplit(target).path).replace("\\", "/").rpartition("/")[2].replace("\0", "")
+    return name if name not in ("", ".", "..") else "model.lpc"
+
+
+async def fetch(
+    store: Store,
+    out: Path,
+    options: FetchOptions | None = None,
+    *,
+    begin: Callable[[int], Callable[[int], None]] = lambda _: lambda _: None,
+) -> FetchReport:
+    """Copy a model, or go on with a copy that was begun.
+
+    Parameters
+    ----------
+    store : Store
+        Closed here.
+    out : Path
+        The file.
+    options : FetchOptions, optional
+    begin : callable
+        Called once with the bytes to come; gives what is called with the number of bytes just come.
+
+    Raises
+    ------
+    StoreError, FormatError
+        If the host fails for longer than the patience or the file cannot be written; what came stays.
+    """
+    options = options or FetchOptions()
+    filled = CachedStore(store, Copy(out))
+    try:
+        fetching = _Fetching(filled, out, options)
+        return await fetching.run(begin)
+    finally:
+        await filled.close()
+
+
+class _Fetching:
+    """One run."""
+
+    def __init__(self, store: CachedStore, out: Path, options: FetchOptions) -> None:
+        self.store, self.out, self.options = store, out, options
+        self.problems: dict[int, str] = {}
+        self.reader: Reader
+
+    async def run(self, begin: Callable[[int], Callable[[int], None]]) -> FetchReport:
+        self.reader = await Reader.open(self.store, ReadingOptions(max_bytes=RUN))
+        self._check_disk()
+        if self.reader.index.header.digest != self.store.cache.last_build(self.store.name):
+            raise StoreError(f"{self.out} cannot be written: name another folder")
+        nodes = await self._waiting_for_host(lambda: self.reader.select(self.options.region))
+        nodes = self._within_budget(nodes)
+        missing = self._missing(nodes)
+        size = int(self.reader.index.size[missing].sum())
+        advance = begin(size)
+        await self._waiting_for_host(lambda: self._bring(nodes, advance))
+        await self.store.flush()
+        self._check_disk()
+        bad = await asyncio.get_running_loop().run_in_executor(None, self._check_copy, nodes)
+        if len(bad):  # what the disk damaged comes once more
+            await self._bring(nodes, advance)
+            await self.store.flush()
+            self._check_disk()
+        return self._report(nodes, size)
+
+    def _check_disk(self) -> None:
+        if self.store.broken is not None:
+            raise StoreError(self.store.broken.replace(": going on without it", ""))
+
+    def _missing(self, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+        index = self.reader.index
+        nodes = nodes[~self.store.holds(index.offset[nodes], index.offset[nodes] + index.size[nodes])]
+        return nodes[~np.isin(nodes, list(self.problems))]
+
+    def _within_budget(self, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+        if self.options.most_bytes is None:
+            return nodes
+        index = self.reader.index
+        pages = sum(index.page_range(page).size for page in np.flatnonzero(index.page_loaded).tolist())
+        total = index.header.page0 + pages + np.cumsum(index.size[nodes])
+        return nodes[total <= self.options.most_bytes]
+
+    async def _bring(self, nodes: NDArray[np.int64], advance: Callable[[int], None]) -> None:
+        index = self.reader.index
+        async for node, cloud in self.reader.clouds(self._missing(nodes)):
+            advance(int(index.size[node]))
+            if isinstance(cloud, Corrupt):
+                self.problems[node] = str(cloud)
+            if self.store.waiting > WAITING:
+                await self.store.flush()
+            self._check_disk()
+
+    async def _waiting_for_host(self, work: Callable[[], Any]) -> Any:
+        """Do something, again after pauses while the host does not answer and nothing has come for too long."""
+        clock = asyncio.get_running_loop().time
+        pause, since, before = FIRST_PAUSE, clock(), self.store.held_bytes
+        while True:
+            try:
+                return await work()
+            except Unavailable as error:
+                if self.store.held_bytes > before:
+                    pause, since, before = FIRST_PAUSE, clock(), self.store.held_bytes
+                if clock() - since > self.options.patience:
+                    raise Unavailable(f"{error}; run the same command again to go on") from error
+                await asyncio.sleep(pause)
+                pause = min(2 * pause, LONGEST_PAUSE)
+
+    def _check_copy(self, nodes: NDArray[np.int64]) -> list[int]:
+        """Read the copy back; what is not on the disk as it should be is dropped from the map."""
+        index, bad = self.reader.index, []
+        with self.out.open("rb") as file:
+            for node in nodes.tolist():
+                if node in self.problems:
+                    continue
+                place = index.cloud_range(node)
+                file.seek(place.start)
+                if zlib.crc32(file.read(place.size)) != int(index.crc[node]):
+                    self.store.reject(place)
+                    bad.append(node)
+            if index.page_loaded.all():
+                self._check_digest(file)
+        return bad
+
+    def _check_digest(self, file: Any) -> None:
+        """Check that header and records are those of the build id, once all of them are here."""
+        index, records = self.reader.index, []
+        for page in range(len(index.page_loaded)):
+            place = index.page_range(page)
+            file.seek(place.start)
+            records.append(file.read(place.size)[PAGE_HEADER:])
+        if compute_digest(index.header, records) != index.header.digest:
+            raise Corrupt(f"{self.store.name}: its index is not that of its build id: ask its publisher for it anew")
+
+    def _report(self, nodes: NDArray[np.int64], size: int) -> FetchReport:
+        index = self.reader.index
+        left = int(index.size[self._missing(nodes)].sum())
+        known = np.flatnonzero(index.known)
+        held = self.store.holds(index.offset[known], index.offset[known] + index.size[known])
+        whole = bool(self.store.holds(np.array([0]), np.array([index.header.bytes]))[0])
+        return FetchReport(
+            path=str(self.out),
+            clouds=int(held.sum()),
+            clouds_total=index.header.nodes,
+            bytes=self.store.held_bytes,
+            bytes_total=index.header.bytes,
+            bytes_fetched=size - left,
+            complete=whole,
+            problems=tuple(f"{text}; it is missing in the copy" for text in self.problems.values()),
+        )

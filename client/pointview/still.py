@@ -1,0 +1,141 @@
+"""One picture of one model: open, settle the view, draw."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from pointstream.layer import AccessLayer, LayerOptions
+from pointstream.stores import open_store
+
+from .budget import tolerance_for_budget
+from .camera import Camera
+from .refine import Cut, refine
+from .render import Frame, Kind, Style, open_backend
+from .settle import settle
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from pointstream.cache import Cache
+
+CAPACITY = 4 << 30
+"""Bytes of decoded clouds: a still picture holds its whole cut, however fine."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StillOptions:
+    """What to draw, and how.
+
+    Parameters
+    ----------
+    width, height : int
+        Pixels.
+    view : mapping, optional
+        A VIEW.json object; the whole model if not given.
+    tolerance : float
+        Projected spacing at which refinement stops, pixels.
+    budget : int, optional
+        Most splats; raises the tolerance where it is exceeded.
+    backend : {"auto", "gl", "cpu"}
+    threads : int
+        Threads of the CPU backend.
+    style : Style
+    patience : float
+        Seconds to wait for a host that sends nothing.
+    """
+
+    width: int = 1024
+    height: int = 768
+    view: Mapping[str, Any] | None = None
+    tolerance: float = 1.0
+    budget: int | None = None
+    backend: Kind = "auto"
+    threads: int = 1
+    style: Style = field(default_factory=Style)
+    patience: float = 60.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Still:
+    """A picture and its figures.
+
+    Parameters
+    ----------
+    frame : Frame
+    cut : Cut
+    report : dict
+        The contract's keys of ``render --json``.
+    problems : tuple of str
+        What kept data from coming, a line each.
+    """
+
+    frame: Frame
+    cut: Cut
+    report: dict[str, Any]
+    problems: tuple[str, ...]
+
+
+async def draw_still(
+    target: str,
+    options: StillOptions,
+    *,
+    cache: Cache | None = None,
+    progress: Callable[[Cut], None] | None = None,
+) -> Still:
+    """Draw one picture of the model at a path or address; `cache` keeps what comes from an address.
+
+    Raises
+    ------
+    StoreError, FormatError
+        If the model cannot be opened, or the view is none.
+    """
+    if options.view is not None:  # a wrong view costs no connection
+        Camera.from_view(options.view, width=options.width, height=options.height)
+    store = open_store(target, clock=time.monotonic, cache=cache)
+    layer = await AccessLayer.open(store, options=LayerOptions(capacity=CAPACITY), clock=time.monotonic)
+    try:
+        look = partial(_look, options=options)
+        cut = await settle(layer, look, clock=time.monotonic, patience=options.patience, progress=progress)
+        camera = _camera(layer, options)
+        backend = open_backend(options.backend, layer.header, threads=options.threads)
+        try:
+            backend.draw(cut, layer.take, camera, options.style)  # uploads, and compiles at the first use
+            start = time.perf_counter()
+            look(layer)
+            frame = backend.draw(cut, layer.take, camera, options.style)
+            frame_ms = 1e3 * (time.perf_counter() - start)
+        finally:
+            backend.close()
+        report = {
+            "backend": backend.name,
+            "splats": frame.splats,
+            "clouds": frame.clouds,
+            "starved_clouds": int(cut.starved.sum()),
+            "culled": asdict(cut.culled),
+            "frame_ms": round(frame_ms, 3),
+            "bytes_read": layer.stats.bytes_received,
+        }
+        problems = tuple(f"{error.text} ({error.count} times)" for error in layer.stats.errors)
+        return Still(frame=frame, cut=cut, report=report, problems=problems)
+    finally:
+        await layer.close()
+
+
+def _camera(layer: AccessLayer, options: StillOptions) -> Camera:
+    if options.view is None:
+        return Camera.frame_model(layer.header, width=options.width, height=options.height)
+    return Camera.from_view(options.view, width=options.width, height=options.height)
+
+
+def _look(layer: AccessLayer, options: StillOptions) -> Cut:
+    """Compute the cut of what is here; a budget counts what is known, so that it settles on what will be here."""
+    camera, tolerance = _camera(layer, options), options.tolerance
+    one_sided = not options.style.two_sided
+    if options.budget is not None:
+        tolerance = tolerance_for_budget(
+            layer.index, camera, options.budget, layer.index.known, at_least=tolerance, cull_backfaces=one_sided
+        )
+    return refine(layer.index, camera, tolerance, layer.resident, cull_backfaces=one_sided)

@@ -1,0 +1,128 @@
+"""``pointstream stream`` and ``pointstream demo``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pointview.cli import SizeType, ViewType, positive
+
+LONGEST = 3600.0
+"""Seconds: a run keeps two pictures a second in memory."""
+
+
+@click.command()
+@click.argument("model")
+@click.option("--link", required=True, metavar="none|adsl|lan|RATE[,RTT]", help="The line to stream over.")
+@click.option(
+    "--seconds",
+    default=30.0,
+    show_default=True,
+    type=click.FloatRange(min=0.1, max=LONGEST),
+    callback=positive,
+    help="Length of the run.",
+)
+@click.option("--report", required=True, type=click.Path(path_type=Path, file_okay=False), help="Folder to write to.")
+@click.option("--view", type=ViewType(), help="Where to look from; without it the whole model is framed.")
+@click.option("--path", type=click.Path(path_type=Path, dir_okay=False), help="PATH.json: views at times.")
+@click.option("--clock", default="real", show_default=True, type=click.Choice(["real", "virtual"]))
+@click.option("--size", type=SizeType(), default="1024x768", show_default=True, help="Picture size in pixels.")
+@click.option(
+    "--tolerance",
+    default=1.0,
+    show_default=True,
+    type=float,
+    callback=positive,
+    help="Spacing of samples on the screen that is fine enough, pixels.",
+)
+@click.option("--priority", default="index", show_default=True, type=click.Choice(["index", "error"]))
+@click.option("--json", "as_json", is_flag=True, help="Print report.json on stdout.")
+def stream(
+    model: str,
+    link: str,
+    seconds: float,
+    report: Path,
+    view: dict[str, Any] | None,
+    path: Path | None,
+    clock: str,
+    size: tuple[int, int],
+    tolerance: float,
+    priority: str,
+    as_json: bool,
+) -> None:
+    """Stream MODEL over a link and report its error against run time."""
+    from pointlink.profiles import parse_profile
+    from pointstream.progress import progress
+
+    from .experiment import Experiment, run_experiment
+    from .path import ViewPath
+    from .report import prepare_folder, write_report
+
+    if view is not None and path is not None:
+        raise click.UsageError("--view and --path exclude each other")
+    try:
+        profile = parse_profile(link)
+    except ValueError as error:
+        raise click.BadParameter(str(error), param_hint="--link") from error
+    views = None
+    if path is not None:
+        views = ViewPath.read(path)
+    elif view is not None:
+        views = ViewPath.still(view)
+    experiment = Experiment(
+        model=model,
+        link=link,
+        profile=profile,
+        clock="virtual" if clock == "virtual" else "real",
+        seconds=seconds,
+        size=size,
+        tolerance=tolerance,
+        priority="error" if priority == "error" else "index",
+        views=views,
+    )
+    prepare_folder(report)
+    result, moments = run_experiment(experiment, say=lambda line: click.echo(line, err=True), progress=progress)
+    written = write_report(report, result, moments)
+    for text in result.errors:
+        click.echo(f"pointstream: {text}", err=True)
+    if as_json:
+        click.echo(json.dumps(asdict(result), allow_nan=False))
+        return
+    first = "never" if result.first_picture_s is None else f"{result.first_picture_s:.2f} s"
+    settled = "not within the run" if result.settled_s is None else f"{result.settled_s:.2f} s"
+    use = "no limit" if result.link_utilisation is None else f"{100 * result.link_utilisation:.1f} %"
+    click.echo(f"first picture   {first}")
+    click.echo(f"settled         {settled}")
+    click.echo(f"received        {result.bytes:,} bytes in {result.requests} requests")
+    click.echo(f"link used       {use}")
+    click.echo(f"report          {written[0]}")
+
+
+@click.command()
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("out/demo"),
+    show_default=True,
+    help="Folder for the model, the pictures and the report.",
+)
+@click.option("--scan", type=click.Path(path_type=Path, exists=True, dir_okay=False), help="A scan of your own.")
+@click.option(
+    "--seconds",
+    default=30.0,
+    show_default=True,
+    type=click.FloatRange(min=1.0, max=LONGEST),
+    callback=positive,
+    help="Length of the run.",
+)
+@click.option("--link", default="adsl", show_default=True, metavar="none|adsl|lan|RATE[,RTT]")
+def demo(out: Path, scan: Path | None, seconds: float, link: str) -> None:
+    """Build a model, serve it, stream it over 1.25 Mbit/s: the whole tour."""
+    from .demo import tour
+
+    for line in tour(out, scan=scan, seconds=seconds, link=link):
+        click.echo(line)

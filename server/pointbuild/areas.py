@@ -1,0 +1,233 @@
+"""How much surface each cell holds: the density of the scan, measured where it is.
+
+The spacing of a region is sqrt(pi / 8) times the median distance to the eighth neighbour: a disc of that radius holds
+eight samples of area r^2 each. (The mean distance to the *nearest* neighbour is about half of it.) Regions are cells
+of at most 2 M samples. What a region holds does not depend on buckets or thresholds, so neither does the result.
+
+Surface adds up: an inner cell has the area of its halves. A cell of few samples takes the density of its sibling.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numba import njit
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from .cells import Cells
+
+NEIGHBOURS = 8
+FEWEST = 32
+"""Samples of a region that is measured."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Probing:
+    """How areas are measured; a function of the input's size and M only.
+
+    Parameters
+    ----------
+    region : int
+        Samples that a region has at most.
+    queries : int
+        Samples per region whose neighbours are looked for, at a cost of about 1 ns each for every sample.
+    """
+
+    region: int
+    queries: int
+
+    @classmethod
+    def of(cls, samples: int, cloud_size: int) -> Probing:
+        """Probe small models more densely: they have few regions."""
+        return cls(region=max(2 * cloud_size, 256), queries=min(max(2**24 // samples, 16), 256))
+
+
+@dataclass(frozen=True, slots=True)
+class Areas:
+    """Cells of a bucket in preorder, down to the regions.
+
+    Parameters
+    ----------
+    low, high : ndarray, (n,) int64
+        Samples of the cell, a range in the order of paths.
+    area : ndarray, (n,) float64
+        Model units squared; nan for a lone cell with too few samples.
+    region : ndarray, (n,) bool
+    spacing : ndarray, (n,) float64
+        Of measured regions; nan elsewhere.
+    """
+
+    low: NDArray[np.int64]
+    high: NDArray[np.int64]
+    area: NDArray[np.float64]
+    region: NDArray[np.bool_]
+    spacing: NDArray[np.float64]
+
+    def of(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Area of cells given by their ranges: those of nodes, which may be smaller than a region."""
+        out = np.empty(len(low))
+        _look_up(self.low, self.high, self.area, self.region, low, high, out)
+        return out
+
+
+def measure(
+    cells: Cells,
+    probing: Probing,
+    fixed: NDArray[np.uint64],
+    xyz: NDArray[np.float64],
+    priority: NDArray[np.uint64],
+    depth: int,
+) -> Areas:
+    """Areas of all cells of a bucket.
+
+    Parameters
+    ----------
+    cells, probing
+    fixed : ndarray, (n, 3) uint64
+        Coordinates in the order of paths.
+    xyz : ndarray, (n, 3) float64
+        The same samples in model units.
+    priority : ndarray, (n,) uint64
+        The smallest of a region make the queries.
+    depth : int
+        Of the bucket's cell.
+    """
+    most = 2 * len(fixed) * (cells.depths + 1 - depth) // (probing.region + 1) + 2
+    table = np.empty((4, most), np.int64)
+    count = _divide(cells.axes, cells.shifts, fixed, depth, probing.region, table)
+    low, high, level, parent = table[:, :count].copy()
+    # A region has no child: in preorder a child follows its parent at once.
+    region = np.append(parent[1:] != np.arange(count - 1), True)
+    spacing = np.full(count, np.nan)
+    measured = np.flatnonzero(region & ((high - low >= FEWEST) | (level == 0)))
+    faces = cells.faces(fixed[low[measured]], level[measured])
+    _probe(xyz, priority, low[measured], high[measured], faces, probing.queries, measured, spacing)
+    area = spacing**2 * (high - low)
+    _add_up(low, high, parent, region, area)
+    return Areas(low, high, area, region, spacing)
+
+
+@njit(cache=True, nogil=True)
+def _divide(axes: Any, shifts: Any, fixed: Any, depth0: int, region: int, table: Any) -> int:
+    """Cells in preorder until a cell is a region."""
+    waiting = np.empty((2 * 256 + 2, 4), np.int64)
+    waiting[0] = (0, len(fixed), depth0, -1)
+    stacked, count = 1, 0
+    while stacked:
+        stacked -= 1
+        low, high, depth, parent = waiting[stacked]
+        cell = count
+        count += 1
+        table[0, cell], table[1, cell], table[2, cell], table[3, cell] = low, high, depth, parent
+        coincide = True
+        for axis in range(3):
+            coincide = coincide and fixed[low, axis] == fixed[high - 1, axis]
+        if high - low <= region or coincide:
+            continue
+        axis, shift = axes[depth], np.uint64(shifts[depth])
+        first, last = low, high
+        while first < last:
+            middle = (first + last) // 2
+            if (fixed[middle, axis] >> shift) & np.uint64(1):
+                last = middle
+            else:
+                first = middle + 1
+        if first < high:
+            waiting[stacked] = (first, high, depth + 1, cell)
+            stacked += 1
+        if low < first:
+            waiting[stacked] = (low, first, depth + 1, cell)
+            stacked += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _probe(xyz: Any, priority: Any, lows: Any, highs: Any, faces: Any, queries: int, cell: Any, spacing: Any) -> None:
+    """Spacing of regions."""
+    chosen = np.empty(queries, np.int64)
+    best = np.empty(queries, np.uint64)
+    nearest = np.empty(8)
+    distance = np.empty(queries)
+    inside = np.empty(queries, np.bool_)
+    for r in range(len(lows)):
+        low, high = lows[r], highs[r]
+        x, y, z = xyz[low:high, 0].copy(), xyz[low:high, 1].copy(), xyz[low:high, 2].copy()
+        squared = np.empty(high - low)
+        count = 0
+        for i in range(low, high):  # the samples of smallest priority
+            if count < queries or priority[i] < best[count - 1]:
+                at = min(count, queries - 1)
+                while at > 0 and best[at - 1] > priority[i]:
+                    best[at], chosen[at] = best[at - 1], chosen[at - 1]
+                    at -= 1
+                best[at], chosen[at] = priority[i], i - low
+                count = min(count + 1, queries)
+        within = 0
+        for q in range(count):
+            px, py, pz = x[chosen[q]], y[chosen[q]], z[chosen[q]]
+            for i in range(len(squared)):
+                dx, dy, dz = x[i] - px, y[i] - py, z[i] - pz
+                squared[i] = dx * dx + dy * dy + dz * dz
+            found = 0
+            for i in range(len(squared)):
+                value = squared[i]
+                if value > 0.0 and (found < 8 or value < nearest[found - 1]):
+                    at = min(found, 7)
+                    while at > 0 and nearest[at - 1] > value:
+                        nearest[at] = nearest[at - 1]
+                        at -= 1
+                    nearest[at] = value
+                    found = min(found + 1, 8)
+            radius = np.sqrt(nearest[found - 1]) if found else 0.0
+            distance[q] = radius * np.sqrt(np.pi / max(found, 1))
+            inside[q] = (
+                px - radius > faces[r, 0] and py - radius > faces[r, 1] and pz - radius > faces[r, 2]
+                and px + radius < faces[r, 3] and py + radius < faces[r, 4] and pz + radius < faces[r, 5]
+            )  # fmt: skip
+            within += inside[q]
+        if 2 * within >= count:  # a disc that leaves the cell may miss neighbours beyond the face
+            kept = 0
+            for q in range(count):
+                if inside[q]:
+                    distance[kept] = distance[q]
+                    kept += 1
+            count = kept
+        ordered = np.sort(distance[:count])
+        spacing[cell[r]] = (ordered[(count - 1) // 2] + ordered[count // 2]) / 2.0
+
+
+@njit(cache=True, nogil=True)
+def _add_up(low: Any, high: Any, parent: Any, region: Any, area: Any) -> None:
+    """Areas of inner cells from their halves, then of unmeasured halves from their sibling."""
+    count = len(low)
+    known = np.zeros(count, np.int64)  # samples of the halves that were measured
+    for cell in range(count):
+        if not region[cell]:
+            area[cell] = 0.0
+    for cell in range(count - 1, -1, -1):
+        if not region[cell]:
+            area[cell] *= (high[cell] - low[cell]) / known[cell] if known[cell] else np.nan
+        above = parent[cell]
+        if above >= 0 and not np.isnan(area[cell]):
+            known[above] += high[cell] - low[cell]
+            area[above] += area[cell]
+    for cell in range(1, count):
+        if np.isnan(area[cell]):
+            above = parent[cell]
+            area[cell] = area[above] * (high[cell] - low[cell]) / (high[above] - low[above])
+
+
+@njit(cache=True, nogil=True)
+def _look_up(lows: Any, highs: Any, area: Any, region: Any, low: Any, high: Any, out: Any) -> None:
+    """Areas of ranges: descend the preorder to the smallest cell that holds the range."""
+    for i in range(len(low)):
+        cell = 0
+        while not region[cell] and (lows[cell] != low[i] or highs[cell] != high[i]):
+            cell += 1
+            while highs[cell] <= low[i]:  # not in the lower half: on to the upper one
+                cell += 1
+        out[i] = area[cell] * (high[i] - low[i]) / (highs[cell] - lows[cell])

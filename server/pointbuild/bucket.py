@@ -1,0 +1,282 @@
+"""One bucket in memory: sorted along the curve, measured, grown into a tree, and written back node by node."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numba import njit
+
+from lpc.octahedral import decode_normals
+
+from .areas import Probing, measure
+from .rows import as_words
+from .tree import Tree, grow
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from .cells import Cells
+    from .plan import Bucket
+    from .scatter import Regions
+
+INDEX_BITS = 22
+MAX_BUCKET = 1 << INDEX_BITS
+"""Samples of a bucket: a place in it and 42 path bits share a word while sorting."""
+
+NORMAL_UNIT = 1 << 24
+"""Normals are summed as whole multiples of 1 / NORMAL_UNIT, so that no sum depends on an order."""
+
+
+@dataclass(frozen=True, slots=True)
+class Clouds:
+    """Runs of rows that belong together, and what the bounds of nodes are made from.
+
+    Parameters
+    ----------
+    first, samples : ndarray, (n,) int64
+        Rows of each run.
+    box : ndarray, (n, 6) float64
+        Low and high corner.
+    normals : ndarray, (n, 3) int64
+        Sum of the unit normals times `NORMAL_UNIT`.
+    bare : ndarray, (n,) int64
+        Samples without a normal.
+    """
+
+    first: NDArray[np.int64]
+    samples: NDArray[np.int64]
+    box: NDArray[np.float64]
+    normals: NDArray[np.int64]
+    bare: NDArray[np.int64]
+
+    def part(self, which: slice | NDArray[np.int64]) -> Clouds:
+        """Take some of the runs."""
+        return Clouds(self.first[which], self.samples[which], self.box[which], self.normals[which], self.bare[which])
+
+
+@dataclass(frozen=True, slots=True)
+class BucketTree:
+    """What is kept of a bucket when its rows are back on disk.
+
+    Parameters
+    ----------
+    tree : Tree
+        Its own nodes.
+    clouds : Clouds
+        Of those nodes.
+    upper : ndarray, (u,) int64
+        Upper nodes that take samples of the bucket.
+    fragments : Clouds
+        What they take, in the same order.
+    area : ndarray, (n,) float64
+        Of the nodes' cells; nan if the whole bucket is too small to be measured.
+    cell_area : float
+        Of the bucket's cell.
+    spacing, weight : ndarray
+        Of the regions that were measured, and their samples.
+    """
+
+    tree: Tree
+    clouds: Clouds
+    upper: NDArray[np.int64]
+    fragments: Clouds
+    area: NDArray[np.float64]
+    cell_area: float
+    spacing: NDArray[np.float64]
+    weight: NDArray[np.int64]
+
+
+def normal_table(bits: int) -> NDArray[np.int32]:
+    """Decode all codes, ``table[u << bits | v]`` in multiples of 1 / `NORMAL_UNIT`."""
+    codes = np.arange(1 << (2 * bits))
+    pairs = np.stack([codes >> bits, codes & ((1 << bits) - 1)], axis=1).astype(np.uint8)
+    return np.rint(decode_normals(pairs, bits).astype(np.float64) * NORMAL_UNIT).astype(np.int32)
+
+
+def partition(
+    first_row: int,
+    bucket: Bucket,
+    above: list[int],
+    thresholds: list[int],
+    *,
+    cells: Cells,
+    probing: Probing,
+    cloud_size: int,
+    regions: Regions,
+    normals: NDArray[np.int32] | None,
+) -> BucketTree:
+    """Sort a bucket's rows by node, in place on disk.
+
+    Parameters
+    ----------
+    first_row, bucket
+        Which rows.
+    above, thresholds : list of int
+        Upper nodes from the root to the bucket, and up to which priority each takes samples.
+    cells, probing, cloud_size
+        How to divide and measure.
+    regions : Regions
+        The file.
+    normals : ndarray or None
+        `normal_table`, if rows have normals.
+    """
+    rows = np.empty(bucket.count, regions.dtype)
+    regions.read(first_row, rows)
+    rows, scratch = sort_by_path(rows, cells, bucket)
+    fixed = cells.fixed(rows["xyz"])
+    priority = np.ascontiguousarray(rows["priority"])
+    areas = measure(cells, probing, fixed, rows["xyz"], priority, bucket.depth)
+    tree, owner = grow(cells, fixed, priority, scratch, bucket.depth, thresholds[-1] if above else -1, cloud_size)
+    del fixed
+    limits = np.array(thresholds, np.uint64)
+    taken = np.flatnonzero(owner < 0)
+    group = owner + np.int32(len(above))
+    group[taken] = np.searchsorted(limits, priority[taken])
+    counts = np.bincount(group, minlength=len(above) + len(tree))
+    ends = np.cumsum(counts)
+    order = np.empty(len(rows), np.int32)
+    _order(group, ends - counts, order)
+    del owner, group, priority
+    out = np.empty_like(rows)
+    np.take(as_words(rows), order, axis=0, out=as_words(out), mode="clip")  # "raise" would copy once more
+    clouds = _clouds(out, ends - counts, counts, normals)
+    regions.write(first_row, out)
+    clouds.first[:] += first_row
+    used = np.flatnonzero(counts[: len(above)])
+    measured = np.flatnonzero(areas.region & (areas.spacing > 0))
+    return BucketTree(
+        tree=tree,
+        clouds=clouds.part(slice(len(above), None)),
+        upper=np.array(above, np.int64)[used],
+        fragments=clouds.part(used),
+        area=areas.of(tree.low, tree.high),
+        cell_area=float(areas.area[0]),
+        spacing=areas.spacing[measured],
+        weight=(areas.high - areas.low)[measured],
+    )
+
+
+def sort_by_path(rows: NDArray[Any], cells: Cells, bucket: Bucket) -> tuple[NDArray[Any], NDArray[np.uint64]]:
+    """Rows in the order of their paths, and a spare array of one word per row.
+
+    Rows of equal paths come in any order.
+    """
+    if bucket.coincident:
+        return rows, np.empty(len(rows), np.uint64)
+    window = cells.window(bucket.depth, 64 - INDEX_BITS)
+    packed = cells.keys(rows["xyz"], window)
+    _pack(packed)
+    packed.sort()
+    order = np.empty(len(rows), np.int32)
+    tied = _unpack(packed, order)
+    if tied and window.bits == 64 - INDEX_BITS:
+        # 42 bits did not tell some apart: the rest of the path does. Rare, so a general sort will do.
+        rest = cells.fixed(rows["xyz"])
+        _sort_ties(packed, order, rest, cells.axes, cells.shifts, bucket.depth + window.bits)
+    out = np.empty_like(rows)
+    np.take(as_words(rows), order, axis=0, out=as_words(out), mode="clip")  # "raise" would copy once more
+    return out, packed
+
+
+@njit(cache=True, nogil=True)
+def _pack(keys: Any) -> None:
+    for i in range(len(keys)):
+        keys[i] = keys[i] << np.uint64(22) | np.uint64(i)
+
+
+@njit(cache=True, nogil=True)
+def _unpack(packed: Any, order: Any) -> Any:
+    """Fill `order`; whether neighbours share a key."""
+    tied = False
+    for i in range(len(packed)):
+        order[i] = packed[i] & np.uint64(4194303)
+        tied |= i > 0 and packed[i] >> np.uint64(22) == packed[i - 1] >> np.uint64(22)
+    return tied
+
+
+@njit(cache=True, nogil=True)
+def _sort_ties(packed: Any, order: Any, fixed: Any, axes: Any, shifts: Any, start: int) -> None:
+    """Put runs of equal keys in the order of the path bits from `start` on: a binary radix exchange sort."""
+    waiting = np.empty((300, 3), np.int64)
+    begin = 0
+    while begin < len(packed):
+        end = begin + 1
+        while end < len(packed) and packed[end] >> np.uint64(22) == packed[begin] >> np.uint64(22):
+            end += 1
+        stacked = 0
+        if end > begin + 1:
+            waiting[0] = (begin, end, start)
+            stacked = 1
+        while stacked:
+            stacked -= 1
+            low, high, depth = waiting[stacked]
+            same = True
+            while same and depth < len(axes):  # skip the bits that all share
+                axis, shift = axes[depth], np.uint64(shifts[depth])
+                bit = (fixed[order[low], axis] >> shift) & np.uint64(1)
+                for i in range(low + 1, high):
+                    if (fixed[order[i], axis] >> shift) & np.uint64(1) != bit:
+                        same = False
+                        break
+                depth += same
+            if same:
+                continue
+            i, j = low, high - 1
+            while i <= j:
+                if (fixed[order[i], axes[depth]] >> np.uint64(shifts[depth])) & np.uint64(1):
+                    order[i], order[j] = order[j], order[i]
+                    j -= 1
+                else:
+                    i += 1
+            if i - low > 1:
+                waiting[stacked] = (low, i, depth + 1)
+                stacked += 1
+            if high - i > 1:
+                waiting[stacked] = (i, high, depth + 1)
+                stacked += 1
+        begin = end
+
+
+@njit(cache=True, nogil=True)
+def _order(group: Any, place: Any, order: Any) -> None:
+    """Stable counting sort; `place` is where each group begins, and is used up."""
+    for i in range(len(group)):
+        order[place[group[i]]] = i
+        place[group[i]] += 1
+
+
+def _clouds(
+    rows: NDArray[Any], first: NDArray[np.int64], samples: NDArray[np.int64], normals: NDArray[np.int32] | None
+) -> Clouds:
+    box = np.empty((len(first), 6))
+    sums, bare = np.zeros((len(first), 3), np.int64), np.zeros(len(first), np.int64)
+    _boxes(rows["xyz"], first, samples, box)
+    if normals is not None:
+        bits = (len(normals).bit_length() - 1) // 2
+        _sum_normals(rows["normal"], normals, bits, first, samples, sums, bare)
+    return Clouds(first.copy(), samples, box, sums, bare)
+
+
+@njit(cache=True, nogil=True)
+def _boxes(xyz: Any, first: Any, samples: Any, box: Any) -> None:
+    for cloud in range(len(first)):
+        for axis in range(3):
+            low, high = np.inf, -np.inf
+            for i in range(first[cloud], first[cloud] + samples[cloud]):
+                low, high = min(low, xyz[i, axis]), max(high, xyz[i, axis])
+            box[cloud, axis], box[cloud, 3 + axis] = low, high
+
+
+@njit(cache=True, nogil=True)
+def _sum_normals(codes: Any, normals: Any, bits: Any, first: Any, samples: Any, sums: Any, bare: Any) -> None:
+    for cloud in range(len(first)):
+        x, y, z = 0, 0, 0
+        for i in range(first[cloud], first[cloud] + samples[cloud]):
+            code = (np.int64(codes[i, 0]) << bits) | np.int64(codes[i, 1])
+            x += normals[code, 0]
+            y += normals[code, 1]
+            z += normals[code, 2]
+            bare[cloud] += code == 0
+        sums[cloud, 0], sums[cloud, 1], sums[cloud, 2] = x, y, z

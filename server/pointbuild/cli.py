@@ -1,0 +1,139 @@
+"""``pointstream build``."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import sys
+import time
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from rich.console import Console
+
+from lpc.errors import LpcError
+from lpc.info import info_dict
+
+from .build import BuildReport, build_model
+from .options import BuildOptions
+from .progress import Bar, Lines, Silent
+from .sizes import parse_size
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from types import FrameType
+
+
+@click.command()
+@click.argument("scans", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="SCAN...")
+@click.option("-o", "--output", "out", required=True, type=click.Path(path_type=Path), metavar="MODEL.lpc")
+@click.option("--cloud-size", default=2048, show_default=True, type=click.IntRange(1, 65535), help="Samples a cloud.")
+@click.option("--memory", default="2G", show_default=True, help="Ceiling on resident memory.")
+@click.option(
+    "--threads", default=0, type=click.IntRange(0), help="Worker threads; default: as many as there are cores."
+)
+@click.option("--position-error", default="auto", show_default=True, metavar="auto|LENGTH",
+              help="How far a sample may move; auto: half the spacing.")  # fmt: skip
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(-(2**63), 2**64 - 1),
+              help="Of the hash that picks each cloud's samples.")  # fmt: skip
+@click.option("--normals", default="auto", show_default=True, type=click.Choice(["auto", "keep", "estimate", "drop"]),
+              help="auto: those of the scan, or of a mesh's faces.")  # fmt: skip
+@click.option("--attributes", default=None, metavar="LIST|all",
+              help="Names with commas between; default: normal,color,intensity,classification.")  # fmt: skip
+@click.option("--effort", default="default", show_default=True, type=click.Choice(["fast", "default", "best"]),
+              help="What packing may cost.")  # fmt: skip
+@click.option("--scratch", default=None, type=click.Path(path_type=Path), help="Directory for temporary files.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+def build(
+    scans: tuple[Path, ...],
+    out: Path,
+    memory: str,
+    position_error: str,
+    attributes: str | None,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Turn scans (PLY, LAS, LAZ, E57, PCD, OBJ, NPZ, text) into one model."""
+    chosen = BuildOptions(
+        memory_bytes=_size(memory),
+        position_error=_length(position_error),
+        attributes=None
+        if attributes is None
+        else tuple(name.strip() for name in attributes.split(",") if name.strip()),
+        **options,
+    )
+    with _stopped_by_signals(), _progress(as_json) as progress:
+        report = build_model(scans, out, chosen, progress, clock=time.monotonic)
+    if as_json:
+        click.echo(json.dumps(report_dict(report)))
+    else:
+        click.echo(_sentence(report, out))
+
+
+def report_dict(report: BuildReport) -> dict[str, Any]:
+    """Describe a build by the contract's keys."""
+    return {
+        **info_dict(report.header),
+        "seconds": round(report.seconds, 3),
+        "samples_per_second": round(report.samples_per_second),
+        "peak_rss_bytes": report.peak_rss_bytes,
+    }
+
+
+def _sentence(report: BuildReport, out: Path) -> str:
+    header = report.header
+    dropped = sum(header.rejected.values())
+    return (
+        f"{out}: {header.samples:,} samples in {header.nodes:,} clouds, {header.levels} levels, {header.bytes:,} bytes "
+        f"({header.bits_per_sample['total']:.1f} bits a sample), {report.seconds:.1f} s"
+        + (f"; {dropped:,} records without a position dropped" if dropped else "")
+    )
+
+
+def _size(text: str) -> int:
+    try:
+        return parse_size(text)
+    except LpcError as error:
+        raise click.BadParameter(str(error), param_hint="--memory") from error
+
+
+def _length(text: str) -> float | None:
+    if text == "auto":
+        return None
+    try:
+        length = float(text)
+    except ValueError:
+        length = math.nan
+    if not (math.isfinite(length) and length > 0):
+        raise click.BadParameter(f"{text!r} is neither auto nor a length above 0", param_hint="--position-error")
+    return length
+
+
+def _progress(quiet: bool) -> Any:
+    if quiet:
+        return nullcontext(Silent())
+    console = Console(stderr=True)
+    return Bar(console) if console.is_terminal else Lines(sys.stderr, time.monotonic)
+
+
+@contextmanager
+def _stopped_by_signals() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP unwind the stack as SIGINT does, so that temporary files go."""
+    numbers = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
+
+    def stop(number: int, _: FrameType | None) -> None:
+        for each in numbers:  # cleaning up takes a moment: nothing may interrupt it
+            signal.signal(each, signal.SIG_IGN)
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        raise SystemExit(128 + number)
+
+    before = {number: signal.signal(number, stop) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

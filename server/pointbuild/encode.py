@@ -1,0 +1,213 @@
+"""Clouds to frames, and the spheres and cones that hold what a reader will decode.
+
+Boxes and sums of normals of whole subtrees are known before, so every node has its centre and axis. Each cloud is
+then compared once with all its ancestors: radii and half angles are exact for the samples as they are decoded,
+and a maximum does not depend on who comes first.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numba import njit
+
+from lpc.bounds import decode_centers, quantise_cones, quantise_spheres
+from lpc.codec import Effort, encode_clouds
+from lpc.lattice import quantise
+from lpc.octahedral import decode_normals, encode_normals
+from lpc.page import RECORD
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from lpc.attributes import Schema
+
+    from .assemble import Nodes
+    from .scatter import Regions
+
+
+@dataclass(frozen=True, slots=True)
+class Geometry:
+    """What all clouds of a model share, and the centre and axis of each node.
+
+    Parameters
+    ----------
+    origin : ndarray, (3,) float64
+    step, side : float
+        Of the lattice, and of the fixed-point box of centres.
+    center : ndarray, (n, 3) float64
+        As it is decoded.
+    axis : ndarray, (n, 3) float32
+        As it is decoded; zero: no cone.
+    """
+
+    origin: NDArray[np.float64]
+    step: float
+    side: float
+    center: NDArray[np.float64]
+    axis: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, nodes: Nodes, origin: NDArray[np.float64], high: NDArray[np.float64], step: float) -> Geometry:
+        """Choose centres and axes; the lattice begins at the corner `origin` of the box up to `high`."""
+        side = float((high - origin).max()) * (1 + 2.0**-20) or 1.0
+        center = nodes.box[:, :3] + (nodes.box[:, 3:] - nodes.box[:, :3]) / 2
+        codes = np.clip(np.rint((center - origin) * (2.0**32 / side)), 0, 2**32 - 1).astype(np.uint32)
+        length = np.sqrt((nodes.normals.astype(np.float64) ** 2).sum(axis=1))
+        whole = (nodes.bare == 0) & (length > 0)
+        mean = nodes.normals / np.where(whole, length, 1)[:, None]
+        axis = decode_normals(encode_normals(np.where(whole[:, None], mean, 0.0)))
+        return cls(origin, step, side, decode_centers(codes, origin, side), axis)
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Frames of consecutive nodes from `first` on.
+
+    `reach` and `spread` (k, levels): the largest squared distance of a cloud's samples to the centre of its ancestor
+    at each level, itself included, and of its normals to the ancestor's axis.
+    """
+
+    first: int
+    frames: list[bytes]
+    checks: list[int]
+    reach: NDArray[np.float64]
+    spread: NDArray[np.float64]
+
+
+def encode_run(
+    first: int,
+    stop: int,
+    *,
+    nodes: Nodes,
+    geometry: Geometry,
+    regions: Regions,
+    schema: Schema,
+    effort: Effort,
+    table: NDArray[np.float32] | None,
+) -> Run:
+    """Encode nodes `first` to `stop - 1`.
+
+    `table` are the decoded normals of all codes where the schema has normals (`normal_vectors`).
+    """
+    counts = nodes.samples[first:stop]
+    bounds = np.concatenate([[0], np.cumsum(counts)])
+    rows = np.empty(bounds[-1], regions.dtype)
+    at = 0
+    for run in range(nodes.run_start[first], nodes.run_start[stop]):
+        count = int(nodes.run_count[run])
+        regions.read(int(nodes.run_first[run]), rows[at : at + count])
+        at += count
+    lattice = quantise(rows["xyz"], geometry.origin, geometry.step)
+    codes = {attribute.name: rows[attribute.name] for attribute in schema}
+    frames = encode_clouds(lattice, codes, bounds, schema, effort=effort)
+    shape = (stop - first, int(nodes.depth[first:stop].max()) + 1)
+    reach, spread = np.zeros(shape), np.zeros(shape)
+    _reach(lattice, bounds, first, nodes.parent, nodes.depth, geometry.origin, geometry.step, geometry.center, reach)
+    if table is not None:
+        bits = (len(table).bit_length() - 1) // 2
+        _spread(rows["normal"], table, bits, bounds, first, nodes.parent, nodes.depth, geometry.axis, spread)
+    return Run(first, frames, [zlib.crc32(frame) for frame in frames], reach, spread)
+
+
+def normal_vectors(bits: int) -> NDArray[np.float32]:
+    """Decode all codes: ``table[u << bits | v]``."""
+    codes = np.arange(1 << (2 * bits))
+    return decode_normals(np.stack([codes >> bits, codes & ((1 << bits) - 1)], axis=1).astype(np.uint8), bits)
+
+
+def kernels_are_loaded() -> bool:
+    """Whether this process has encoded a model with normals before."""
+    return bool(_spread.signatures)
+
+
+class Records:
+    """The index records, as far as runs have come in."""
+
+    def __init__(self, nodes: Nodes, geometry: Geometry, spacing: NDArray[np.float32]) -> None:
+        self.nodes, self.geometry = nodes, geometry
+        self.records = np.zeros(len(nodes), RECORD)
+        self.records["spacing"] = spacing
+        self.records["samples"] = nodes.samples
+        self.records["subtree"] = nodes.subtree
+        inner = nodes.parent >= 0
+        np.add.at(self.records["children"], nodes.parent[inner], (1 << nodes.half[inner]).astype(np.uint8))
+        self._reach = np.zeros(len(nodes))
+        self._spread = np.zeros(len(nodes))
+
+    def add(self, run: Run) -> None:
+        """Take in sizes and checksums, and what ancestors must hold."""
+        stop = run.first + len(run.frames)
+        self.records["size"][run.first : stop] = [len(frame) for frame in run.frames]
+        self.records["crc"][run.first : stop] = run.checks
+        _raise(run.reach, run.first, self.nodes.parent, self.nodes.depth, self._reach)
+        _raise(run.spread, run.first, self.nodes.parent, self.nodes.depth, self._spread)
+
+    def finish(self) -> NDArray[Any]:
+        """All records, spheres and cones included."""
+        geometry = self.geometry
+        self.records["center"], self.records["radius"] = quantise_spheres(
+            geometry.center, np.sqrt(self._reach), geometry.origin, geometry.side, 0.0
+        )
+        axis = geometry.axis.astype(np.float64)
+        angle = 2 * np.arcsin(np.minimum(np.sqrt(self._spread) / 2, 1))
+        # Wider than a half space never culls (`lpc.bounds.backfacing`), and chords measure badly there.
+        angle[~axis.any(axis=1) | (angle > np.pi / 2)] = np.pi
+        axis[~axis.any(axis=1)] = (0, 0, 1)
+        self.records["cone_axis"], self.records["cone_angle"] = quantise_cones(axis, angle)
+        return self.records
+
+
+@njit(cache=True, nogil=True, fastmath={"nnan", "nsz"})
+def _reach(
+    lattice: Any, bounds: Any, first: int, parent: Any, depth: Any, origin: Any, step: float, center: Any, out: Any
+) -> None:
+    for cloud in range(len(bounds) - 1):
+        begin, end = bounds[cloud], bounds[cloud + 1]
+        x, y, z = np.empty(end - begin), np.empty(end - begin), np.empty(end - begin)
+        for i in range(end - begin):
+            x[i] = lattice[begin + i, 0] * step + origin[0]
+            y[i] = lattice[begin + i, 1] * step + origin[1]
+            z[i] = lattice[begin + i, 2] * step + origin[2]
+        node = first + cloud
+        while node >= 0:
+            px, py, pz = center[node]
+            largest = 0.0
+            for i in range(len(x)):
+                dx, dy, dz = x[i] - px, y[i] - py, z[i] - pz
+                largest = max(largest, dx * dx + dy * dy + dz * dz)
+            out[cloud, depth[node]] = largest
+            node = parent[node]
+
+
+@njit(cache=True, nogil=True, fastmath={"nnan", "nsz"})
+def _spread(
+    codes: Any, table: Any, bits: int, bounds: Any, first: int, parent: Any, depth: Any, axis: Any, out: Any
+) -> None:
+    for cloud in range(len(bounds) - 1):
+        begin, end = bounds[cloud], bounds[cloud + 1]
+        x, y, z = np.empty(end - begin), np.empty(end - begin), np.empty(end - begin)
+        for i in range(end - begin):
+            code = (np.int64(codes[begin + i, 0]) << bits) | np.int64(codes[begin + i, 1])
+            x[i], y[i], z[i] = table[code, 0], table[code, 1], table[code, 2]
+        node = first + cloud
+        while node >= 0:
+            px, py, pz = float(axis[node, 0]), float(axis[node, 1]), float(axis[node, 2])
+            largest = 0.0
+            for i in range(len(x)):
+                dx, dy, dz = x[i] - px, y[i] - py, z[i] - pz
+                largest = max(largest, dx * dx + dy * dy + dz * dz)
+            out[cloud, depth[node]] = largest
+            node = parent[node]
+
+
+@njit(cache=True, nogil=True)
+def _raise(found: Any, first: int, parent: Any, depth: Any, largest: Any) -> None:
+    for cloud in range(len(found)):
+        node = first + cloud
+        while node >= 0:
+            largest[node] = max(largest[node], found[cloud, depth[node]])
+            node = parent[node]

@@ -1,0 +1,138 @@
+"""Several scans as one input: which attributes all of them have, and one coordinate system."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lpc.attributes import MAX_ATTRIBUTES
+from lpc.errors import BuildError
+from lpc.points import PointBatch
+
+from .readers import Scan, open_scan
+from .readers.scan import DEFAULT_ATTRIBUTES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from .options import BuildOptions
+
+Source = Scan | Path | str
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """Scans one after another; a sample's place in the input runs through all of them.
+
+    Parameters
+    ----------
+    scans : tuple of Scan
+    attributes : dict of str to dtype
+        What every scan has and the options ask for.
+    left_out : dict of str to str
+        What some scan has and the model will not have, and why.
+    crs : str or None
+    """
+
+    scans: tuple[Scan, ...]
+    attributes: dict[str, np.dtype[Any]]
+    left_out: dict[str, str]
+    crs: str | None
+
+    @property
+    def samples_hint(self) -> int | None:
+        """Records in all scans, where each of them says how many it has."""
+        hints = [scan.info.samples_hint for scan in self.scans]
+        return None if None in hints else sum(hint for hint in hints if hint is not None)
+
+    @property
+    def samples_at_most(self) -> int:
+        """`samples_hint`, or a number that the files' lengths hardly allow to exceed."""
+        shortest = 16  # bytes of a record
+        return sum(
+            scan.info.raw_bytes // shortest if scan.info.samples_hint is None else scan.info.samples_hint
+            for scan in self.scans
+        )
+
+    def batches(self, size: int) -> Iterator[PointBatch]:
+        """Yield the samples of all scans with the common attributes only."""
+        for scan in self.scans:
+            for batch in scan.batches(size):
+                yield PointBatch(batch.xyz, {name: batch.attributes[name] for name in self.attributes})
+
+
+def open_inputs(
+    sources: Sequence[Source], options: BuildOptions, estimate: Callable[[Scan], Scan] | None = None
+) -> Inputs:
+    """Open what is a path, and find out what the scans have in common.
+
+    Parameters
+    ----------
+    sources : sequence of paths and scans
+    options : BuildOptions
+    estimate : callable, optional
+        Gives a scan with normals for a scan without; used where the options ask for it.
+
+    Raises
+    ------
+    ScanError
+        If a file cannot be read.
+    BuildError
+        If there is no scan, the coordinate systems differ, or a named attribute is nowhere.
+    """
+    if not sources:
+        raise BuildError("no scan is given")
+    wanted = options.attributes
+    everything = wanted is not None and not set(wanted) <= set(DEFAULT_ATTRIBUTES)
+    scans = tuple(
+        open_scan(source, normals=options.normals, attributes="all" if everything else "default")
+        if isinstance(source, str | Path)
+        else source
+        for source in sources
+    )
+    if options.normals == "estimate" and estimate is not None:
+        scans = tuple(estimate(scan) for scan in scans)
+    first = scans[0].info
+    for scan in scans[1:]:
+        if scan.info.crs != first.crs:
+            raise BuildError(
+                f"{first.path} and {scan.info.path} have different coordinate systems: "
+                "bring them into one, then build them together"
+            )
+    left_out: dict[str, str] = {}
+    for scan in scans:
+        left_out.update(scan.info.left_out)
+    attributes = _common(scans, left_out)
+    if wanted is not None and "all" not in wanted:
+        absent = sorted(set(wanted) - set(attributes) - set(left_out))
+        if absent:
+            found = ", ".join(attributes) or "none"
+            raise BuildError(f"no attribute {absent[0]!r} in the scans: those that all have are {found}")
+        for name in attributes.keys() - set(wanted):
+            left_out[name] = "not asked for (--attributes)"
+    if options.normals == "drop" and "normal" in attributes:
+        left_out["normal"] = "dropped (--normals drop)"
+    attributes = {name: dtype for name, dtype in attributes.items() if name not in left_out}
+    if len(attributes) > MAX_ATTRIBUTES:
+        raise BuildError(f"{len(attributes)} attributes are too many: name at most {MAX_ATTRIBUTES} with --attributes")
+    return Inputs(scans, attributes, left_out, first.crs)
+
+
+def _common(scans: tuple[Scan, ...], left_out: dict[str, str]) -> dict[str, np.dtype[Any]]:
+    """Attributes that every scan has with one dtype; the reasons of the others go to `left_out`."""
+    names = dict.fromkeys(name for scan in scans for name in scan.info.attributes)
+    common = {}
+    for name in names:
+        dtypes = [scan.info.attributes[name] for scan in scans if name in scan.info.attributes]
+        if len(dtypes) < len(scans):
+            where = next(scan.info.path.name for scan in scans if name not in scan.info.attributes)
+            left_out[name] = f"{where} has none"
+        elif len(set(dtypes)) > 1:
+            left_out[name] = f"its type differs between the scans ({dtypes[0]} and others)"
+        else:
+            left_out.pop(name, None)
+            common[name] = np.dtype(dtypes[0])
+    return common

@@ -1,0 +1,175 @@
+"""From rows sorted by node to the finished file: encode, index, write."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, BinaryIO
+
+import numpy as np
+
+from lpc.errors import BuildError
+from lpc.header import Header, seal
+from lpc.lattice import SLACK, position_error_bound, position_step
+from lpc.page import PAGE_HEADER, RECORD
+
+from .costs import KINDS, bits_per_sample, cloud_costs
+from .encode import Geometry, Records, Run, encode_run, normal_vectors
+from .spacing import node_spacings
+from .survey import NORMAL_BITS, Survey
+from .write import write_model
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from lpc.codec import Effort
+
+    from .assemble import Nodes
+    from .divide import Division
+    from .inputs import Inputs
+    from .options import BuildOptions
+    from .progress import Progress
+    from .scatter import Regions
+    from .work import Crew
+
+GENERATOR = "pointstream 0.1"
+
+RUN_SAMPLES = 1 << 15
+"""Encoded at a time by one thread."""
+
+COSTED_CLOUDS = 256
+"""Clouds, evenly over the tree, that say what each kind of number costs."""
+
+
+def publish(
+    division: Division,
+    found: Survey,
+    inputs: Inputs,
+    regions: Regions,
+    options: BuildOptions,
+    *,
+    clouds_path: Path,
+    out: Path,
+    crew: Crew,
+    progress: Progress,
+) -> Header:
+    """Write the model and give its header.
+
+    Parameters
+    ----------
+    division, found, inputs
+        The tree, what the survey found, and what is known of the scans.
+    regions : Regions
+        Rows sorted by node.
+    options : BuildOptions
+    clouds_path, out : Path
+        Of a temporary file for the clouds, and of the model.
+    crew, progress
+        Threads, and who is told.
+
+    Raises
+    ------
+    BuildError
+        If no lattice can hold the samples within the wanted error.
+    """
+    nodes = division.nodes
+    extent = float((found.high - found.low).max())
+    step = choose_step(division.spacing, extent, options.position_error)
+    geometry = Geometry.of(nodes, found.low, found.high, step)
+    spacing, ratio = node_spacings(nodes, division.spacing, step)
+    progress.stage("encode", int(nodes.subtree[0]))
+    with clouds_path.open("w+b") as clouds:
+        records = Records(nodes, geometry, spacing)
+        costs = _encode(records, clouds, regions, found, options.effort, crew, progress)
+        pages = -(-len(nodes) // options.page_nodes)
+        header = Header(
+            bytes=2**53,
+            samples=int(nodes.subtree[0]),
+            nodes=len(nodes),
+            levels=int(nodes.depth.max()) + 1,
+            cloud_size=options.cloud_size,
+            page_nodes=options.page_nodes,
+            origin=_triple(found.low),
+            step=step,
+            side=geometry.side,
+            bounds=(*_triple(found.low), *_triple(found.high)),
+            spacing=division.spacing,
+            position_error=position_error_bound(step, found.low, extent),
+            attributes=found.schema,
+            constants=found.constants,
+            crs=inputs.crs,
+            left_out={**inputs.left_out, **found.left_out},
+            rejected=found.rejected,
+            bits_per_sample=bits_per_sample(
+                costs, clouds.tell(), PAGE_HEADER * pages + RECORD.itemsize * len(nodes), int(nodes.subtree[0])
+            ),
+            spacing_ratio=ratio,
+            seed=options.seed,
+            generator=GENERATOR,
+        )
+        finished = records.finish()
+        header = seal(header, finished)
+        progress.stage("write", header.samples)
+        write_model(out, header, finished, clouds)
+    progress.advance(header.samples)
+    return header
+
+
+def choose_step(spacing: float, extent: float, position_error: float | None) -> float:
+    """Edge of a lattice cell.
+
+    Raises
+    ------
+    BuildError
+        If half the spacing as a bound takes more bits than a coordinate has, or the wanted error does.
+    """
+    step = position_step(spacing, extent, position_error)
+    if position_error is None and spacing > 0 and step > SLACK * spacing:
+        raise BuildError(
+            f"the samples are {spacing:g} apart but spread over {extent:g}, more than 48 bits a coordinate can tell: "
+            "remove the outliers, or allow a larger --position-error"
+        )
+    return step
+
+
+def _encode(
+    records: Records,
+    clouds: BinaryIO,
+    regions: Regions,
+    found: Survey,
+    effort: Effort,
+    crew: Crew,
+    progress: Progress,
+) -> dict[str, float]:
+    """Write all clouds in order and fill the records; what the kinds of numbers cost in some of the clouds."""
+    nodes, geometry = records.nodes, records.geometry
+    has_normals = any(attribute.kind == "normal" for attribute in found.schema)
+    table = normal_vectors(NORMAL_BITS) if has_normals else None
+
+    def one(run: tuple[int, int]) -> Run:
+        return encode_run(
+            *run, nodes=nodes, geometry=geometry, regions=regions, schema=found.schema, effort=effort, table=table
+        )
+
+    costs = dict.fromkeys(KINDS, 0.0)
+    costed = set(np.linspace(0, len(nodes) - 1, COSTED_CLOUDS).astype(int).tolist())
+    for (first, stop), run in crew.map(one, runs(nodes, RUN_SAMPLES)):
+        clouds.writelines(run.frames)
+        records.add(run)
+        for node in costed.intersection(range(first, stop)):
+            for kind, size in cloud_costs(run.frames[node - first], int(nodes.samples[node]), found.schema).items():
+                costs[kind] += size
+        progress.advance(int(nodes.samples[first:stop].sum()))
+    return costs
+
+
+def runs(nodes: Nodes, samples: int) -> list[tuple[int, int]]:
+    """Cut the nodes into runs of about so many samples."""
+    run = np.cumsum(nodes.samples) // samples
+    starts = np.flatnonzero(np.diff(run, prepend=-1)).tolist()
+    return list(zip(starts, [*starts[1:], len(nodes)], strict=True))
+
+
+def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z

@@ -1,0 +1,72 @@
+"""A sample as one row of bytes: what the passes after the survey move around.
+
+A row holds the position as it came (float64, so that the final quantisation is as exact as the input), the priority,
+and the attribute codes. Rows are whole 8-byte words, which is how kernels copy them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from lpc.attributes import Attribute, Schema
+
+XYZ_WORDS = 3
+PRIORITY_WORD = 3
+
+
+def row_dtype(schema: Schema) -> np.dtype[Any]:
+    """Fields ``xyz``, ``priority`` and one per attribute, widest first, padded to whole words."""
+    names, formats, offsets, end = ["xyz", "priority"], ["(3,)<f8", "<u8"], [0, 24], 32
+    for attribute in sorted(schema, key=lambda entry: -entry.code_dtype.itemsize):
+        item = attribute.code_dtype
+        shape = "" if attribute.components == 1 else f"({attribute.components},)"
+        names.append(attribute.name)
+        formats.append(f"{shape}<u{item.itemsize}")
+        offsets.append(end)
+        end += item.itemsize * attribute.components
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": -(-end // 8) * 8})
+
+
+def fill_rows(
+    dtype: np.dtype[Any], values: Mapping[str, NDArray[Any]], priority: NDArray[np.uint64], schema: Schema
+) -> NDArray[Any]:
+    """Rows of spooled samples.
+
+    Parameters
+    ----------
+    dtype : dtype
+        Of `row_dtype`.
+    values : mapping of str to ndarray
+        Spool columns; normals are codes already.
+    priority : ndarray, (n,) uint64
+    schema : Schema
+    """
+    rows = np.zeros(len(priority), dtype)
+    rows["xyz"] = values["xyz"]
+    rows["priority"] = priority
+    for attribute in schema:
+        column = values[attribute.name]
+        rows[attribute.name] = column if attribute.kind == "normal" else encode_values(attribute, column)
+    return rows
+
+
+def encode_values(attribute: Attribute, values: NDArray[Any]) -> NDArray[Any]:
+    """`Attribute.encode`, without its detour over 64 bits where a shift does."""
+    if attribute.offset == 0 and values.dtype.kind == "u":
+        if attribute.scale == 1:
+            return values.astype(attribute.code_dtype)
+        if attribute.scale in (256, 257) and values.dtype.itemsize == 2:
+            return (values >> 8).astype(np.uint8)  # 257 v is v in both bytes
+    return attribute.encode(values)
+
+
+def as_words(rows: NDArray[Any]) -> NDArray[np.uint64]:
+    """Rows as (n, words) uint64."""
+    return rows.view(np.uint64).reshape(len(rows), -1)

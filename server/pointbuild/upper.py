@@ -1,0 +1,152 @@
+"""The upper tree: up to which priority each of its nodes takes samples.
+
+A node takes the M smallest priorities in its cell that are above what its parent took. So one number per node says
+it all: a sample of bucket b belongs to the first node on the path from the root whose *threshold* is not below its
+priority, and to the bucket's own tree if it is above them all. Thresholds come from candidates, the samples of small
+priority that the scatter set aside.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from .plan import Cell, Plan
+    from .scatter import Candidates
+
+ALL = np.uint64(2**64 - 1)
+
+
+@dataclass(frozen=True, slots=True)
+class UpperNode:
+    """A node above the buckets.
+
+    Parameters
+    ----------
+    parent, half : int
+        Its parent among the upper nodes (-1: it is the root), and which half of the parent's cell it is.
+    cell : Cell
+    subtree, samples : int
+        Of the node with its descendants, and of its own cloud.
+    threshold : int
+        Largest priority that it takes.
+    """
+
+    parent: int
+    half: int
+    cell: Cell
+    subtree: int
+    samples: int
+    threshold: int
+
+
+@dataclass(frozen=True, slots=True)
+class Upper:
+    """The upper tree in preorder, and for each bucket the way down to it.
+
+    Parameters
+    ----------
+    nodes : list of UpperNode
+    parent, half : list of int
+        For each bucket the upper node above it, and which half of that cell it is; -1 and 0 for a lone bucket.
+    taken : list of int
+        For each bucket how many of its samples upper nodes take.
+    """
+
+    nodes: list[UpperNode]
+    parent: list[int]
+    half: list[int]
+    taken: list[int]
+
+    def above(self, bucket: int) -> list[int]:
+        """Upper nodes from the root down to the bucket."""
+        path, node = [], self.parent[bucket]
+        while node >= 0:
+            path.append(node)
+            node = self.nodes[node].parent
+        return path[::-1]
+
+
+def candidate_limits(plan: Plan, cloud_size: int, slack: float) -> NDArray[np.uint64]:
+    """Priorities up to which the samples of each bucket may be taken by the upper tree.
+
+    The expected threshold of a node is T / C of the range, with C the samples of its cell and T those drawn there
+    by LPC equation 1; `slack` is how many standard deviations of T are added.
+    """
+    limits = np.zeros(len(plan.buckets), np.uint64)
+
+    def visit(cell: Cell, drawn: float, most: int) -> None:
+        if cell.is_bucket:
+            limits[cell.buckets[0]] = most
+            return
+        drawn += cloud_size
+        enough = drawn + slack * math.sqrt(drawn) + 4 * slack
+        most = max(most, min(int(enough / cell.count * 2.0**64), int(ALL)))
+        for child in cell.children:
+            if child is not None:
+                visit(child, drawn * child.count / cell.count, most)
+
+    visit(plan.root, 0.0, 0)
+    return limits
+
+
+def thresholds(plan: Plan, candidates: Candidates, limits: NDArray[np.uint64], cloud_size: int) -> Upper | None:
+    """Exact thresholds.
+
+    Parameters
+    ----------
+    plan : Plan
+    candidates : Candidates
+        All samples whose priority is at most that of their bucket in `limits`.
+    limits : ndarray, (buckets,) uint64
+    cloud_size : int
+        M.
+
+    Returns
+    -------
+    Upper or None
+        None if some node wants a sample that is no candidate; try larger limits.
+    """
+    order = np.lexsort((candidates.priority, candidates.bucket))
+    priority, bucket = candidates.priority[order], candidates.bucket[order]
+    first = np.searchsorted(bucket, np.arange(len(plan.buckets) + 1))
+    count = np.array([entry.count for entry in plan.buckets])
+    used = np.zeros(len(plan.buckets), np.int64)  # candidates of each bucket that are taken, in order of priority
+    upper = Upper([], [-1] * len(plan.buckets), [0] * len(plan.buckets), [])
+
+    def visit(cell: Cell, parent: int, half: int) -> bool:
+        begin, end = cell.buckets
+        inside = slice(begin, end)
+        left = int((count[inside] - used[inside]).sum())
+        if cell.is_bucket or not left:
+            upper.parent[inside] = [parent] * (end - begin)
+            upper.half[inside] = [half] * (end - begin)
+            return True
+        free = np.concatenate([priority[first[b] + used[b] : first[b + 1]] for b in range(begin, end)])
+        if left <= cloud_size:
+            threshold = ALL
+            if len(free) < left:
+                return False
+        else:
+            if len(free) < cloud_size:
+                return False
+            threshold = np.partition(free, cloud_size - 1)[cloud_size - 1]
+            if threshold > limits[inside].min():
+                return False
+        for b in range(begin, end):
+            used[b] = np.searchsorted(priority[first[b] : first[b + 1]], threshold, side="right")
+        node = UpperNode(parent, half, cell, left, min(left, cloud_size), int(threshold))
+        upper.nodes.append(node)
+        number = len(upper.nodes) - 1
+        return all(visit(child, number, side) for side, child in enumerate(cell.children) if child is not None)
+
+    if not visit(plan.root, -1, 0):
+        return None
+    upper.taken.extend(used.tolist())
+    return upper
