@@ -287,7 +287,9 @@ def _link(seen: Observations) -> list[Finding]:
     if seen.goodput is not None:
         size = f"{seen.goodput_bytes / 1e6:.2g} MB"
         rough = " (roughly: the file is small)" if seen.goodput_bytes < 4 * SLOW_START else ""
-        findings.append(Finding("goodput", "good", f"{8 * seen.goodput / 1e6:.3g} Mbit/s over {size}{rough}"))
+        megabits = 8 * seen.goodput / 1e6
+        rate = f"{megabits:.3g}" if megabits < 1000 else f"{megabits:.0f}"
+        findings.append(Finding("goodput", "good", f"{rate} Mbit/s over {size}{rough}"))
     else:
         findings.append(Finding("goodput", "unknown", "not measured"))
     return findings

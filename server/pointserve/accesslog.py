@@ -14,12 +14,17 @@ from aiohttp.abc import AbstractAccessLogger
 from .board import CUT
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from .board import Seat
 
 LOGGER = logging.getLogger("pointserve")
 
 SENT_BYTES = web.RequestKey("sent_bytes", int)
 """Bytes of the body that were sent; not set where the whole of a small reply was."""
+
+BEGAN = web.RequestKey("began", float)
+"""When the head of the request was there, by the ledger's clock; the event loop's own time may be a millisecond old."""
 
 SHOWN = 200
 """Characters of a Range field that are repeated."""
@@ -58,13 +63,18 @@ class Ledger:
     ----------
     seat : Seat
         Where they are counted.
+    clock : callable of float
+        Monotonic seconds.
     """
 
-    def __init__(self, seat: Seat) -> None:
+    def __init__(self, seat: Seat, clock: Callable[[], float]) -> None:
         self._seat = seat
+        self.clock = clock
 
-    def note(self, request: web.BaseRequest, status: int, sent: int, seconds: float, *, cut: bool = False) -> None:
+    def note(self, request: web.BaseRequest, status: int, sent: int, *, cut: bool = False) -> None:
         """Take note of a reply that ended, as promised or `cut` short."""
+        now = self.clock()
+        seconds = now - request.get(BEGAN, now)
         self._seat.count(status, sent, seconds)
         if cut:
             self._seat.row[CUT] += 1
@@ -94,10 +104,10 @@ class AccessLog(AbstractAccessLogger):
         super().__init__(logger, log_format)
         self._ledger = ledger
 
-    def log(self, request: web.BaseRequest, response: web.StreamResponse, time: float) -> None:
+    def log(self, request: web.BaseRequest, response: web.StreamResponse, time: float) -> None:  # noqa: ARG002
         """Take note of a reply."""
         without_body = request.method == "HEAD" or response.status in (204, 304)
         sent = request.get(SENT_BYTES)
         if sent is None:
             sent = 0 if without_body else response.content_length or 0
-        self._ledger.note(request, response.status, sent, time)
+        self._ledger.note(request, response.status, sent)

@@ -13,7 +13,7 @@ from aiohttp import HttpVersion11, web
 
 from lpc.errors import NotFound, StoreError
 
-from .accesslog import LOGGER, SENT_BYTES, Ledger
+from .accesslog import BEGAN, LOGGER, SENT_BYTES, Ledger
 from .board import ADMISSION, Board, Seat
 from .catalogue import Catalogue, Entry
 from .cors import Cors
@@ -45,7 +45,6 @@ class _Service:
     pace: Pace
     seat: Seat
     ledger: Ledger
-    clock: Callable[[], float]
     wall: Callable[[], float]
     cacheable: Fields
 
@@ -76,8 +75,7 @@ def make_app(
         cors=Cors(config.cors),
         pace=Pace(patience=config.patience, slowest=config.slowest, cap=cap),
         seat=seat,
-        ledger=Ledger(seat),
-        clock=clock,
+        ledger=Ledger(seat, clock),
         wall=wall,
         cacheable=(("Cache-Control", f"{keepers}, max-age={config.max_age}"),),
     )
@@ -93,6 +91,11 @@ def make_app(
     app.on_response_prepare.append(_finish_fields)
     app.cleanup_ctx.append(_descriptors)
     return app
+
+
+def ledger_of(app: web.Application) -> Ledger:
+    """Return what counts the replies of an application."""
+    return app[SERVICE].ledger
 
 
 async def _descriptors(app: web.Application) -> AsyncIterator[None]:
@@ -147,15 +150,19 @@ async def _listed(request: web.Request) -> tuple[Entry, ...]:
 
 async def _health(request: web.Request) -> web.Response:
     service = request.app[SERVICE]
-    entries = await service.catalogue.entries()
-    text = "ok\n" if service.config.guard.closed else f"ok, {len(entries)} models\n"
+    models = await _count_models(service)
+    text = "ok\n" if service.config.guard.closed else f"ok, {models} models\n"
     return web.Response(text=text, headers=dict(_UNCACHEABLE))
 
 
 async def _metrics(request: web.Request) -> web.Response:
     service = request.app[SERVICE]
-    body = exposition(service.seat.board, len(await service.catalogue.entries()))
+    body = exposition(service.seat.board, await _count_models(service))
     return web.Response(body=body, headers={"Content-Type": MEDIA_TYPE, **dict(_UNCACHEABLE)})
+
+
+async def _count_models(service: _Service) -> int:
+    return sum(entry.header is not None for entry in await service.catalogue.entries())
 
 
 async def _options(request: web.Request) -> web.Response:
@@ -191,15 +198,15 @@ async def _errors(request: web.Request, handler: Handler) -> web.StreamResponse:
     if "Host" not in request.headers and request.version == HttpVersion11:  # RFC 9112 3.2
         return _line(400, "an HTTP/1.1 request needs a Host field")
     service = request.app[SERVICE]
+    request[BEGAN] = service.ledger.clock()
     if not _admitted(request, service):
         service.seat.row[ADMISSION] += 1
         return _line(401, "show a token, or a signed address that has not expired", _CHALLENGE)
-    began = service.clock()
     try:
         return await handler(request)
     except (ConnectionError, asyncio.CancelledError):
         # The reader has gone, or the server stops: aiohttp writes no line for a reply that did not end.
-        service.ledger.note(request, 499, request.get(SENT_BYTES, 0), service.clock() - began, cut=True)
+        service.ledger.note(request, 499, request.get(SENT_BYTES, 0), cut=True)
         raise
     except NotFound:
         return _line(404, "there is nothing of that name here")  # the same words for what is hidden and what is absent

@@ -13,8 +13,8 @@ from aiohttp import web
 
 from lpc.errors import StoreError
 
-from .accesslog import LOGGER, Ledger
-from .app import make_app
+from .accesslog import LOGGER
+from .app import ledger_of, make_app
 from .board import CONNECTIONS, REFUSED, Board
 
 if TYPE_CHECKING:
@@ -216,7 +216,7 @@ async def _listen(
     manager = runner.server
     assert manager is not None
     guests = Guests(config.connections, config.per_address, seat)
-    logger_class = Ledger(seat).logger_class()
+    logger_class = ledger_of(runner.app).logger_class()
 
     def connection() -> Connection:
         return Connection(
