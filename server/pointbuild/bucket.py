@@ -55,6 +55,10 @@ class Clouds:
         """Take some of the runs."""
         return Clouds(self.first[which], self.samples[which], self.box[which], self.normals[which], self.bare[which])
 
+    def arrays(self) -> list[NDArray[Any]]:
+        """Give what `Clouds` is called with."""
+        return [self.first, self.samples, self.box, self.normals, self.bare]
+
 
 @dataclass(frozen=True, slots=True)
 class BucketTree:
@@ -87,6 +91,19 @@ class BucketTree:
     spacing: NDArray[np.float64]
     weight: NDArray[np.int64]
 
+    def arrays(self) -> list[NDArray[Any]]:
+        """Everything, for a journal."""
+        cell = np.array(self.cell_area)
+        rest = [self.upper, self.area, cell, self.spacing, self.weight]
+        return [self.tree.table(), *self.clouds.arrays(), *self.fragments.arrays(), *rest]
+
+    @classmethod
+    def from_arrays(cls, arrays: list[NDArray[Any]]) -> BucketTree:
+        """Inverse of `arrays`."""
+        table, *rest = arrays
+        upper, area, cell, spacing, weight = rest[10:]
+        return cls(Tree(*table), Clouds(*rest[:5]), upper, Clouds(*rest[5:10]), area, float(cell), spacing, weight)
+
 
 def normal_table(bits: int) -> NDArray[np.int32]:
     """Decode all codes, ``table[u << bits | v]`` in multiples of 1 / `NORMAL_UNIT`."""
@@ -107,7 +124,7 @@ def partition(
     regions: Regions,
     normals: NDArray[np.int32] | None,
 ) -> BucketTree:
-    """Sort a bucket's rows by node, in place on disk.
+    """Sort a bucket's rows by node, in place on disk; `Regions.settle` may be called once the result is safe.
 
     Parameters
     ----------
@@ -142,7 +159,7 @@ def partition(
     out = np.empty_like(rows)
     np.take(as_words(rows), order, axis=0, out=as_words(out), mode="clip")  # "raise" would copy once more
     clouds = _clouds(out, ends - counts, counts, normals)
-    regions.write(first_row, out)
+    regions.replace(first_row, out)
     clouds.first[:] += first_row
     used = np.flatnonzero(counts[: len(above)])
     measured = np.flatnonzero(areas.region & (areas.spacing > 0))

@@ -9,13 +9,13 @@
 
 Each stage needs its own input and the results of those before it, nothing else, and works on blocks, buckets or nodes
 that do not know of each other. Which thread takes which, and how large blocks and buckets are, leaves no trace in
-the bytes.
+the bytes. Each keeps a journal of what it has done, from which a build that was killed goes on (`folder`).
 """
 
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, astuple, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,13 +29,15 @@ from .arrays import ArrayScan
 from .cells import Cells
 from .divide import divide
 from .encode import kernels_are_loaded
+from .folder import Folder, manifest_of, work_folder
 from .inputs import Inputs, Source, open_inputs
+from .journal import as_array, from_array
 from .options import BuildOptions
 from .progress import Progress, Silent
-from .publish import publish
+from .publish import GENERATOR, publish
 from .scatter import Regions
-from .spool import Spool
-from .survey import columns_of, survey
+from .spool import Block, Spool
+from .survey import Survey, columns_of, survey
 from .work import Crew
 
 if TYPE_CHECKING:
@@ -77,6 +79,7 @@ def build_model(
     progress: Progress | None = None,
     *,
     clock: Callable[[], float],
+    tell: Callable[[str], None] = lambda _: None,
 ) -> BuildReport:
     """Build one model of some scans.
 
@@ -90,6 +93,8 @@ def build_model(
     progress : Progress, optional
     clock : callable
         Seconds, monotonic.
+    tell : callable
+        Gets a sentence where a build that was killed left files.
 
     Raises
     ------
@@ -102,45 +107,53 @@ def build_model(
     out = Path(out)
     disk.check_target(out)
     progress = progress or Silent()
-    with disk.translated(out), disk.scratch_folder(options.scratch or out.parent, out.name) as scratch:
-        estimate = partial(_estimate, scratch=scratch, options=options)
-        inputs = open_inputs(sources, options, estimate)
+    manifest = manifest_of(sources, options, GENERATOR)
+    with disk.translated(out), work_folder(options.scratch or out.parent, out, manifest, tell) as folder:
         if not kernels_are_loaded():
-            _warm(scratch)
-        header = _build(inputs, out, scratch, options, progress)
+            _warm(folder)
+        header = _build(sources, out, folder, options, progress)
     return BuildReport(header=header, seconds=clock() - began, peak_rss_bytes=memory.peak_bytes())
 
 
-def _estimate(scan: Scan, *, scratch: Path, options: BuildOptions) -> Scan:
-    from . import normals  # scipy is wanted only here
-
-    return normals.estimate(scan, scratch, options.memory_bytes)
-
-
-def _warm(scratch: Path) -> None:
+def _warm(folder: Folder) -> None:
     """Build a small model, so that all kernels are compiled or loaded before the memory that is left is measured."""
     xyz = np.random.default_rng(0).random((600, 3))
     points = PointBatch(xyz, {"normal": xyz.astype(np.float32), "color": (xyz * 255).astype(np.uint8)})
     options = BuildOptions(cloud_size=64, bucket_samples=256, block_samples=400, memory_bytes=1 << 40, threads=1)
-    _build(open_inputs([ArrayScan(points)], options), scratch / "warm.lpc", scratch, options, Silent())
+    folder.remove("warm")
+    path = folder.path / "warm"
+    path.mkdir()
+    _build([ArrayScan(points)], path / "warm.lpc", Folder(path), options, Silent())
+    folder.remove("warm")
 
 
-def _build(inputs: Inputs, out: Path, scratch: Path, options: BuildOptions, progress: Progress) -> Header:
-    columns = columns_of(inputs.attributes)
-    spool_bytes = sum(column.itemsize for column in columns)
-    row_bytes = -(-(spool_bytes + 8) // 8) * 8  # with a priority, in whole words; codes are never wider than values
-    samples = inputs.samples_at_most
-    disk.check_space(samples, scratch, out, spool_bytes, row_bytes)
-    sizes = memory.choose_sizes(options, samples, row_bytes, memory.resident_bytes())
-    spool_path = scratch / "spool"
+def _build(sources: Sequence[Source], out: Path, folder: Folder, options: BuildOptions, progress: Progress) -> Header:
+    """Go through the stages; what the folder's journals know is not done again."""
+    journal = folder.journal("survey")
+    recalled = next(iter(journal), None)
+    if recalled is None:
+        folder.remove("normals-*")
+        inputs = open_inputs(sources, options, partial(_estimate, scratch=folder.path, options=options))
+        sizes, blocks = _sizes(inputs, out, folder, options), None
+    else:
+        told = from_array(recalled[0])
+        inputs, sizes = Inputs.from_json(told["inputs"]), memory.Sizes(**told["sizes"])
+        blocks = [Block(*block) for block in recalled[1].tolist()]
     # The crew comes last and goes first: no thread may hold a file that is closed.
     with (
-        closing(Spool(spool_path, columns)) as spool,
-        closing(Regions(scratch / "rows")) as regions,
+        closing(Spool(folder.path / "spool", columns_of(inputs.attributes), blocks)) as spool,
+        closing(Regions(folder.path / "rows")) as regions,
         Crew(sizes.threads) as crew,
     ):
-        progress.stage("read", inputs.samples_hint)
-        found = survey(inputs.batches(sizes.block), spool, crew, progress)
+        progress.stage("read", spool.samples or inputs.samples_hint)
+        if recalled is None:
+            found = survey(inputs.batches(sizes.block), spool, crew, progress)
+            told = {"inputs": inputs.to_json(), "sizes": asdict(sizes), "found": found.to_json()}
+            journal.add(as_array(told), np.array([astuple(block) for block in spool.blocks], np.int64))
+            folder.remove("normals-*")
+        else:
+            found = Survey.from_json(told["found"])
+            progress.advance(spool.samples)
         division = divide(
             spool,
             Cells.over(found.low, found.high),
@@ -149,19 +162,23 @@ def _build(inputs: Inputs, out: Path, scratch: Path, options: BuildOptions, prog
             cloud_size=options.cloud_size,
             seed=options.seed,
             bucket_samples=sizes.bucket,
+            folder=folder,
             crew=crew,
             progress=progress,
         )
-        spool.close()
-        spool_path.unlink()  # its room is the model's
-        return publish(
-            division,
-            found,
-            inputs,
-            regions,
-            options,
-            clouds_path=scratch / "clouds",
-            out=out,
-            crew=crew,
-            progress=progress,
-        )
+        return publish(division, found, inputs, regions, options, folder=folder, out=out, crew=crew, progress=progress)
+
+
+def _estimate(scan: Scan, *, scratch: Path, options: BuildOptions) -> Scan:
+    from . import normals  # scipy is wanted only here
+
+    return normals.estimate(scan, scratch, options.memory_bytes)
+
+
+def _sizes(inputs: Inputs, out: Path, folder: Folder, options: BuildOptions) -> memory.Sizes:
+    """Check the disk, and share out the memory."""
+    spool_bytes = sum(column.itemsize for column in columns_of(inputs.attributes))
+    row_bytes = -(-(spool_bytes + 8) // 8) * 8  # with a priority, in whole words; codes are never wider than values
+    samples = inputs.samples_at_most
+    disk.check_space(samples, folder.path, folder.used_bytes(), out, spool_bytes, row_bytes)
+    return memory.choose_sizes(options, samples, row_bytes, memory.resident_bytes())

@@ -1,21 +1,20 @@
-"""Where a build may write, how much it will need, and what is left behind: nothing."""
+"""Where a build may write, and how much it will need."""
 
 from __future__ import annotations
 
 import errno
 import os
 import shutil
-import tempfile
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lpc.errors import BuildError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-CLOUD_BYTES = 16  # per sample, at most: colour scans need about 5
+    from pathlib import Path
+FIXED = 64 << 20
+"""Buckets that are being written back, journals and pages of a small model."""
 
 
 def check_target(out: Path) -> None:
@@ -29,22 +28,26 @@ def check_target(out: Path) -> None:
 
 
 def needed_bytes(samples: int, spool_bytes: int, row_bytes: int) -> tuple[int, int]:
-    """Temporary bytes at the worst moment, and bytes of the model at most."""
-    model = samples * CLOUD_BYTES + 65536
-    return max(samples * (spool_bytes + row_bytes), samples * row_bytes + model), model
+    """Predict the temporary bytes at the worst moment, and those of the model.
+
+    The spool gives way to the rows, and the rows to the model: never are two of them whole. A cloud has less than
+    4 bytes a sample for a position at half the spacing, and attributes take no more than they came with.
+    """
+    model = samples * (4 + max(spool_bytes - 24, 0)) + FIXED
+    return max(samples * row_bytes + model, 2 * model), model
 
 
-def check_space(samples: int, scratch: Path, out: Path, spool_bytes: int, row_bytes: int) -> None:
-    """Raise BuildError if the disks are too full for so many samples."""
+def check_space(samples: int, folder: Path, used: int, out: Path, spool_bytes: int, row_bytes: int) -> None:
+    """Raise BuildError if the disks are too full for so many samples; `used` bytes of the folder can be had again."""
     temporary, model = needed_bytes(samples, spool_bytes, row_bytes)
-    needs = {scratch: temporary, out.parent: model}
-    if scratch.stat().st_dev == out.parent.stat().st_dev:
-        needs = {scratch: max(temporary, samples * row_bytes + 2 * model)}
-    for folder, need in needs.items():
-        free = free_bytes(folder)
+    needs = {folder: temporary - used}
+    if folder.stat().st_dev != out.parent.stat().st_dev:
+        needs[out.parent] = model
+    for place, need in needs.items():
+        free = free_bytes(place)
         if need > free:
             raise BuildError(
-                f"the build needs about {_size(need)} in {folder.parent if folder == scratch else folder}, which has "
+                f"the build needs about {_size(need)} in {place.parent if place == folder else place}, which has "
                 f"{_size(free)} free: make room, or choose another place for temporary files (--scratch)"
             )
 
@@ -52,18 +55,6 @@ def check_space(samples: int, scratch: Path, out: Path, spool_bytes: int, row_by
 def free_bytes(folder: Path) -> int:
     """Bytes that may still be written in a directory."""
     return shutil.disk_usage(folder).free
-
-
-@contextmanager
-def scratch_folder(parent: Path, name: str) -> Iterator[Path]:
-    """Make a directory for temporary files; it is removed however the block ends."""
-    if not parent.is_dir():
-        raise BuildError(f"there is no directory {parent} for temporary files; make it first")
-    folder = Path(tempfile.mkdtemp(prefix=f".{name}.", suffix=".build", dir=parent))
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from .assemble import Nodes, assemble
 from .bucket import BucketTree, normal_table, partition
 from .plan import Plan, make_plan
 from .rows import row_dtype
-from .scatter import Candidates, Regions, scatter
+from .scatter import Candidates, Regions, Scattered, gather, scatter
 from .spacing import model_spacing
 from .survey import NORMAL_BITS
 from .upper import Upper, candidate_limits, thresholds
@@ -23,12 +23,16 @@ if TYPE_CHECKING:
     from lpc.attributes import Schema
 
     from .cells import Cells
+    from .folder import Folder
     from .progress import Progress
-    from .spool import Spool
+    from .spool import Block, Spool
     from .work import Crew
 
 SLACK = 8.0
-"""Standard deviations that candidates of the upper tree may be off; a shortfall repeats the scatter with more."""
+"""Standard deviations that candidates of the upper tree may be off; a shortfall looks through the rows for more."""
+
+GATHERED = 1 << 16
+"""Rows looked through at a time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +52,7 @@ def divide(
     cloud_size: int,
     seed: int,
     bucket_samples: int,
+    folder: Folder,
     crew: Crew,
     progress: Progress,
     slack: float = SLACK,
@@ -57,7 +62,7 @@ def divide(
     Parameters
     ----------
     spool, cells
-        The samples, and how their box is divided.
+        The samples, which are used up, and how their box is divided.
     regions : Regions
         Gets the rows, in the end sorted by node.
     schema : Schema
@@ -66,6 +71,8 @@ def divide(
         M, and what the priorities hash.
     bucket_samples : int
         Samples sorted in memory at a time; more where a region of `areas` asks for it.
+    folder : Folder
+        Keeps the journals of what is done.
     crew, progress
         Threads, and who is told.
     slack : float
@@ -73,28 +80,31 @@ def divide(
     """
     probing = Probing.of(spool.samples, cloud_size)
     most = max(bucket_samples, probing.region)
-    plan = _count(spool, cells, most, crew, progress)
-    upper = None
-    while upper is None:
-        limits = candidate_limits(plan, cloud_size, slack)
-        candidates = _scatter(spool, cells, plan, limits, seed, schema, regions, crew, progress)
-        upper = thresholds(plan, candidates, limits, cloud_size)
+    plan = _count(spool, cells, most, folder, crew, progress)
+    regions.lay_out(row_dtype(schema), [bucket.count for bucket in plan.buckets])
+    regions.restore()
+    limits = candidate_limits(plan, cloud_size, slack)
+    candidates = _scatter(spool, cells, plan, limits, seed, schema, regions, folder, crew, progress)
+    while (upper := thresholds(plan, candidates, limits, cloud_size)) is None:
         slack *= 4
-    trees = _partition(plan, upper, cells, probing, cloud_size, schema, regions, crew, progress)
+        limits = candidate_limits(plan, cloud_size, slack)
+        candidates = gather(regions, limits, GATHERED)
+    trees = _partition(plan, upper, cells, probing, cloud_size, schema, regions, folder, crew, progress)
     spacing = model_spacing(
         np.concatenate([tree.spacing for tree in trees]), np.concatenate([tree.weight for tree in trees])
     )
     return Division(assemble(plan, upper, trees), spacing)
 
 
-def _count(spool: Spool, cells: Cells, most: int, crew: Crew, progress: Progress) -> Plan:
+def _count(spool: Spool, cells: Cells, most: int, folder: Folder, crew: Crew, progress: Progress) -> Plan:
     if spool.samples > most:
         progress.stage("count", spool.samples)
 
     def positions(number: int) -> NDArray[np.float64]:
         return spool.read(spool.blocks[number], ("xyz",))["xyz"]
 
-    return make_plan(cells, spool.samples, most, positions, len(spool.blocks), crew, progress)
+    blocks, journal = len(spool.blocks), folder.journal("count")
+    return make_plan(cells, spool.samples, most, positions, blocks, crew, progress, journal)
 
 
 def _scatter(
@@ -105,19 +115,28 @@ def _scatter(
     seed: int,
     schema: Schema,
     regions: Regions,
+    folder: Folder,
     crew: Crew,
     progress: Progress,
 ) -> Candidates:
     progress.stage("scatter", spool.samples)
-    regions.lay_out(row_dtype(schema), [bucket.count for bucket in plan.buckets])
 
-    def one(number: int) -> Candidates:
-        return scatter(spool.blocks[number], spool, cells, plan, limits, seed, schema, regions)
+    def one(block: Block) -> Scattered:
+        return scatter(block, spool, cells, plan, limits, seed, schema, regions.dtype)
 
+    journal = folder.journal("scatter")
+    waiting = spool.blocks[::-1]  # from the end of the spool, which makes room for the rows
     found = []
-    for number, candidates in crew.map(one, range(len(spool.blocks))):
-        found.append(candidates)
-        progress.advance(spool.blocks[number].samples)
+    for counts, priority, bucket in journal:
+        regions.skip(counts)
+        found.append(Candidates(priority, bucket))
+        progress.advance(waiting.pop(0).samples)
+    for block, part in crew.map(one, waiting):
+        regions.append(part.rows, part.counts)
+        found.append(part.candidates)
+        journal.add(part.counts, part.candidates.priority, part.candidates.bucket)
+        spool.cut(block)
+        progress.advance(block.samples)
     return Candidates(
         np.concatenate([part.priority for part in found]), np.concatenate([part.bucket for part in found])
     )
@@ -131,6 +150,7 @@ def _partition(
     cloud_size: int,
     schema: Schema,
     regions: Regions,
+    folder: Folder,
     crew: Crew,
     progress: Progress,
 ) -> list[BucketTree]:
@@ -152,8 +172,14 @@ def _partition(
             normals=table,
         )
 
-    trees = []
-    for number, tree in crew.map(one, range(len(plan.buckets))):
+    journal = folder.journal("partition")
+    trees: list[BucketTree] = []
+    for arrays in journal:
+        progress.advance(plan.buckets[len(trees)].count)
+        trees.append(BucketTree.from_arrays(arrays))
+    for number, tree in crew.map(one, range(len(trees), len(plan.buckets))):
         trees.append(tree)
+        journal.add(*tree.arrays())
+        regions.settle(int(regions.first[number]))
         progress.advance(plan.buckets[number].count)
     return trees

@@ -65,7 +65,7 @@ class Geometry:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """Frames of consecutive nodes from `first` on.
+    """Frames of consecutive nodes from `first` on, their sizes and checksums; a recalled run has no frames.
 
     `reach` and `spread` (k, levels): the largest squared distance of a cloud's samples to the centre of its ancestor
     at each level, itself included, and of its normals to the ancestor's axis.
@@ -73,7 +73,8 @@ class Run:
 
     first: int
     frames: list[bytes]
-    checks: list[int]
+    sizes: NDArray[np.uint32]
+    checks: NDArray[np.uint32]
     reach: NDArray[np.float64]
     spread: NDArray[np.float64]
 
@@ -110,7 +111,8 @@ def encode_run(
     if table is not None:
         bits = (len(table).bit_length() - 1) // 2
         _spread(rows["normal"], table, bits, bounds, first, nodes.parent, nodes.depth, geometry.axis, spread)
-    return Run(first, frames, [zlib.crc32(frame) for frame in frames], reach, spread)
+    sizes = np.array([len(frame) for frame in frames], np.uint32)
+    return Run(first, frames, sizes, np.array([zlib.crc32(frame) for frame in frames], np.uint32), reach, spread)
 
 
 def normal_vectors(bits: int) -> NDArray[np.float32]:
@@ -140,8 +142,8 @@ class Records:
 
     def add(self, run: Run) -> None:
         """Take in sizes and checksums, and what ancestors must hold."""
-        stop = run.first + len(run.frames)
-        self.records["size"][run.first : stop] = [len(frame) for frame in run.frames]
+        stop = run.first + len(run.sizes)
+        self.records["size"][run.first : stop] = run.sizes
         self.records["crc"][run.first : stop] = run.checks
         _raise(run.reach, run.first, self.nodes.parent, self.nodes.depth, self._reach)
         _raise(run.spread, run.first, self.nodes.parent, self.nodes.depth, self._spread)

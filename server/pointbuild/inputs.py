@@ -57,6 +57,17 @@ class Inputs:
             for scan in self.scans
         )
 
+    def to_json(self) -> dict[str, Any]:
+        """Give what is still of interest when the samples have been read."""
+        dtypes = {name: dtype.str for name, dtype in self.attributes.items()}
+        return {"attributes": dtypes, "left_out": self.left_out, "crs": self.crs}
+
+    @classmethod
+    def from_json(cls, entry: dict[str, Any]) -> Inputs:
+        """Inverse of `to_json`: inputs without scans."""
+        dtypes = {name: np.dtype(dtype) for name, dtype in entry["attributes"].items()}
+        return cls((), dtypes, entry["left_out"], entry["crs"])
+
     def batches(self, size: int) -> Iterator[PointBatch]:
         """Yield the samples of all scans with the common attributes only."""
         for scan in self.scans:

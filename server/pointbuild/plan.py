@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from .cells import Cells, Window
+    from .journal import Journal
     from .progress import Progress
     from .work import Crew
 
 TABLE_BITS = 18
-TABLE_ENTRIES = 1 << 21  # of all tables of one sweep together
+TABLE_ENTRIES = 1 << 19  # of all tables of one sweep together; every thread counts into its own
 
 Positions = Callable[[int], NDArray[np.float64]]
 
@@ -86,7 +87,14 @@ class Plan:
 
 
 def make_plan(
-    cells: Cells, samples: int, most: int, positions: Positions, blocks: int, crew: Crew, progress: Progress
+    cells: Cells,
+    samples: int,
+    most: int,
+    positions: Positions,
+    blocks: int,
+    crew: Crew,
+    progress: Progress,
+    journal: Journal | None = None,
 ) -> Plan:
     """Count the samples of cells and choose the buckets.
 
@@ -101,12 +109,15 @@ def make_plan(
         Gives the positions (n, 3) of one of `blocks` blocks by its number; each block is asked for once a sweep.
     crew, progress
         Threads, and who is told; each sweep counts as all samples.
+    journal : Journal, optional
+        Of sweeps; those that it knows are not made again.
     """
     if samples <= most or not cells.depths:
         return Plan(Cell(0, samples, (0, 1)), [Bucket(0, samples, coincident=not cells.depths)], [])
     tables: list[Table] = []
     sums: list[NDArray[np.int64]] = []
     waiting, start = 1, 0
+    known = iter(journal or ())
     while waiting:
         window = cells.window(start, min(TABLE_BITS, max((TABLE_ENTRIES // waiting).bit_length() - 1, 1)))
 
@@ -116,10 +127,17 @@ def make_plan(
             cells.count(xyz, window, _descend(cells, tables, xyz), counts)
             return len(xyz), counts
 
-        counts = np.zeros((waiting, 1 << window.bits), np.int64)
-        for _, (done, part) in crew.map(count, range(blocks)):
-            counts += part
-            progress.advance(done)
+        recalled = next(known, None)
+        if recalled is None:
+            counts = np.zeros((waiting, 1 << window.bits), np.int64)
+            for _, (done, part) in crew.map(count, range(blocks)):
+                counts += part
+                progress.advance(done)
+            if journal is not None:
+                journal.add(counts)
+        else:
+            (counts,) = recalled
+            progress.advance(samples)
         start += window.bits
         entries = np.zeros(counts.shape, np.int32)
         crowded = (counts > most) & (start < cells.depths)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
@@ -26,7 +27,9 @@ if TYPE_CHECKING:
 
     from .assemble import Nodes
     from .divide import Division
+    from .folder import Folder
     from .inputs import Inputs
+    from .journal import Journal
     from .options import BuildOptions
     from .progress import Progress
     from .scatter import Regions
@@ -48,7 +51,7 @@ def publish(
     regions: Regions,
     options: BuildOptions,
     *,
-    clouds_path: Path,
+    folder: Folder,
     out: Path,
     crew: Crew,
     progress: Progress,
@@ -62,8 +65,10 @@ def publish(
     regions : Regions
         Rows sorted by node.
     options : BuildOptions
-    clouds_path, out : Path
-        Of a temporary file for the clouds, and of the model.
+    folder : Folder
+        Keeps the clouds until they are all there, and the journal of them.
+    out : Path
+        The model.
     crew, progress
         Threads, and who is told.
 
@@ -78,9 +83,13 @@ def publish(
     geometry = Geometry.of(nodes, found.low, found.high, step)
     spacing, ratio = node_spacings(nodes, division.spacing, step)
     progress.stage("encode", int(nodes.subtree[0]))
-    with clouds_path.open("w+b") as clouds:
+    path = folder.path / "clouds"
+    path.touch()
+    with path.open("r+b") as clouds:
         records = Records(nodes, geometry, spacing)
-        costs = _encode(records, clouds, regions, found, options.effort, crew, progress)
+        costs = _encode(records, clouds, folder.journal("encode"), regions, found, options.effort, crew, progress)
+        regions.close()
+        regions.path.unlink()  # its room is the model's
         pages = -(-len(nodes) // options.page_nodes)
         header = Header(
             bytes=2**53,
@@ -110,7 +119,7 @@ def publish(
         finished = records.finish()
         header = seal(header, finished)
         progress.stage("write", header.samples)
-        write_model(out, header, finished, clouds)
+        write_model(out, folder.part_of(out), header, finished, clouds)
     progress.advance(header.samples)
     return header
 
@@ -135,6 +144,7 @@ def choose_step(spacing: float, extent: float, position_error: float | None) -> 
 def _encode(
     records: Records,
     clouds: BinaryIO,
+    journal: Journal,
     regions: Regions,
     found: Survey,
     effort: Effort,
@@ -151,16 +161,28 @@ def _encode(
             *run, nodes=nodes, geometry=geometry, regions=regions, schema=found.schema, effort=effort, table=table
         )
 
-    costs = dict.fromkeys(KINDS, 0.0)
+    costs = np.zeros(len(KINDS))
     costed = set(np.linspace(0, len(nodes) - 1, COSTED_CLOUDS).astype(int).tolist())
-    for (first, stop), run in crew.map(one, runs(nodes, RUN_SAMPLES)):
-        clouds.writelines(run.frames)
-        records.add(run)
-        for node in costed.intersection(range(first, stop)):
-            for kind, size in cloud_costs(run.frames[node - first], int(nodes.samples[node]), found.schema).items():
-                costs[kind] += size
+    waiting = runs(nodes, RUN_SAMPLES)
+    for sizes, checks, reach, spread, part in journal:
+        first, stop = waiting.pop(0)
+        records.add(Run(first, [], sizes, checks, reach, spread))
+        costs += part
+        clouds.seek(int(sizes.sum(dtype=np.int64)), os.SEEK_CUR)
         progress.advance(int(nodes.samples[first:stop].sum()))
-    return costs
+    clouds.truncate()
+    for (first, stop), run in crew.map(one, waiting):
+        clouds.writelines(run.frames)
+        clouds.flush()
+        records.add(run)
+        part = np.zeros(len(KINDS))
+        for node in sorted(costed.intersection(range(first, stop))):
+            found_costs = cloud_costs(run.frames[node - first], int(nodes.samples[node]), found.schema)
+            part += [found_costs[kind] for kind in KINDS]
+        costs += part
+        journal.add(run.sizes, run.checks, run.reach, run.spread, part)
+        progress.advance(int(nodes.samples[first:stop].sum()))
+    return dict(zip(KINDS, costs.tolist(), strict=True))
 
 
 def runs(nodes: Nodes, samples: int) -> list[tuple[int, int]]:

@@ -1,12 +1,12 @@
 """Pass 2: every sample to its bucket's region of one file, and the first candidates for the upper tree.
 
-The place of a row inside its region depends on which thread came first; nothing later depends on that place.
+Threads sort blocks by bucket, one thread writes them in turn: so the place of a block's rows is known from the
+counts of those before it, and a build that was killed can go on with the next. Nothing else depends on that place.
 """
 
 from __future__ import annotations
 
 import os
-import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,7 @@ from .rows import as_words, fill_rows
 from .spool import Block, Spool, read_all, write_all
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
     from .plan import Plan
 
 
+_PIECE = 1 << 20
+
+
 @dataclass(frozen=True, slots=True)
 class Candidates:
     """Samples that may belong to the upper tree: their priorities and buckets, one entry a sample."""
@@ -36,33 +40,45 @@ class Candidates:
     bucket: NDArray[np.int32]
 
 
+@dataclass(frozen=True, slots=True)
+class Scattered:
+    """A block's rows sorted by bucket, how many each bucket gets, and its candidates."""
+
+    rows: NDArray[Any]
+    counts: NDArray[np.int64]
+    candidates: Candidates
+
+
 class Regions:
     """The file of all rows: bucket b is the rows ``first[b]`` to ``first[b + 1]``.
 
     Parameters
     ----------
     path : Path
-        Is created; removing it is the owner's part.
+        Is created if it is not there; removing it is the owner's part.
     """
 
     def __init__(self, path: Path) -> None:
+        self.path = path
         self.dtype: np.dtype[Any] = np.dtype([])
         self.first = np.zeros(1, np.int64)
         self._filled = np.zeros(0, np.int64)
-        self._lock = threading.Lock()
-        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
 
     def lay_out(self, dtype: np.dtype[Any], counts: list[int]) -> None:
-        """Say what rows are and how many each bucket will have; what was appended is forgotten."""
+        """Say what rows are and how many each bucket will have."""
         self.dtype = dtype
         self.first = np.concatenate([[0], np.cumsum(counts)])
         self._filled = np.zeros(len(counts), np.int64)
 
+    def skip(self, counts: NDArray[np.int64]) -> None:
+        """Pass over rows that were appended before."""
+        self._filled += counts
+
     def append(self, sorted_rows: NDArray[Any], counts: NDArray[np.int64]) -> None:
-        """Add rows that are sorted by bucket, `counts` of each; any thread may."""
-        with self._lock:
-            at = self.first[:-1] + self._filled
-            self._filled += counts
+        """Add rows that are sorted by bucket, `counts` of each; one thread only."""
+        at = self.first[:-1] + self._filled
+        self._filled += counts
         begin = 0
         for bucket in np.flatnonzero(counts):
             end = begin + int(counts[bucket])
@@ -73,9 +89,43 @@ class Regions:
         """Overwrite rows from number `row` on."""
         write_all(self._file, rows, row * self.dtype.itemsize)
 
+    def replace(self, row: int, rows: NDArray[Any]) -> None:
+        """Overwrite rows so that no sample is lost when the build is killed meanwhile; any thread may.
+
+        They are in a file of their own until `settle` is called or `restore` finds them.
+        """
+        part, whole = (self.path.with_name(f"{self.path.name}-{row}.{state}") for state in ("part", "whole"))
+        with part.open("wb") as file:
+            file.write(rows.reshape(-1).view(np.uint8).data)
+        part.rename(whole)
+        self.write(row, rows)
+
+    def settle(self, row: int) -> None:
+        """Rows that were replaced will not be asked for again as they were."""
+        self.path.with_name(f"{self.path.name}-{row}.whole").unlink()
+
+    def restore(self) -> None:
+        """Finish what `replace` may have begun when the build was killed: the order of the rows may have changed."""
+        for part in self.path.parent.glob(f"{self.path.name}-*.part"):
+            part.unlink()
+        for whole in self.path.parent.glob(f"{self.path.name}-*.whole"):
+            at = int(whole.stem.rpartition("-")[2]) * self.dtype.itemsize
+            with whole.open("rb") as file:
+                while piece := file.read(_PIECE):
+                    write_all(self._file, np.frombuffer(piece, np.uint8), at)
+                    at += len(piece)
+            whole.unlink()
+
     def read(self, row: int, out: NDArray[Any]) -> None:
         """Fill `out` with rows from number `row` on."""
         read_all(self._file, out, row * self.dtype.itemsize)
+
+    def chunks(self, bucket: int, rows: int) -> Iterator[NDArray[Any]]:
+        """Yield a bucket's rows in pieces of at most so many."""
+        for at in range(int(self.first[bucket]), int(self.first[bucket + 1]), rows):
+            out = np.empty(min(rows, int(self.first[bucket + 1]) - at), self.dtype)
+            self.read(at, out)
+            yield out
 
     def close(self) -> None:
         """Close the file; twice is fine."""
@@ -92,9 +142,9 @@ def scatter(
     limits: NDArray[np.uint64],
     seed: int,
     schema: Schema,
-    regions: Regions,
-) -> Candidates:
-    """Move one block to the buckets' regions.
+    dtype: np.dtype[Any],
+) -> Scattered:
+    """Sort one block by bucket.
 
     Parameters
     ----------
@@ -106,22 +156,31 @@ def scatter(
         Priorities up to these are candidates.
     seed : int
         Of the priorities.
-    schema, regions
-        What rows look like and where they go.
+    schema, dtype
+        What rows hold and look like.
     """
     values = spool.read(block, ("xyz", *(attribute.name for attribute in schema)))
     priority = priorities(block.first, block.samples, seed)
-    rows = fill_rows(regions.dtype, values, priority, schema)
+    rows = fill_rows(dtype, values, priority, schema)
     bucket = plan.locate(cells, values["xyz"])
     if len(plan.buckets) == 1:
-        regions.append(rows, np.array([block.samples]))
-        return Candidates(np.empty(0, np.uint64), np.empty(0, np.int32))
+        return Scattered(rows, np.array([block.samples]), Candidates(np.empty(0, np.uint64), np.empty(0, np.int32)))
     counts = np.bincount(bucket, minlength=len(plan.buckets))
     out = np.empty_like(rows)
     _sort_rows(as_words(rows), bucket, np.cumsum(counts) - counts, as_words(out))
-    regions.append(out, counts)
     chosen = priority <= limits[bucket]
-    return Candidates(priority[chosen], bucket[chosen])
+    return Scattered(out, counts, Candidates(priority[chosen], bucket[chosen]))
+
+
+def gather(regions: Regions, limits: NDArray[np.uint64], chunk: int) -> Candidates:
+    """Candidates once more from the rows as they were scattered, `chunk` at a time: the limits were too low."""
+    priority, bucket = [np.empty(0, np.uint64)], [np.empty(0, np.int32)]
+    for number, limit in enumerate(limits):
+        for rows in regions.chunks(number, chunk):
+            chosen = rows["priority"][rows["priority"] <= limit]
+            priority.append(chosen)
+            bucket.append(np.full(len(chosen), number, np.int32))
+    return Candidates(np.concatenate(priority), np.concatenate(bucket))
 
 
 @njit(cache=True, nogil=True)

@@ -54,14 +54,17 @@ class Spool:
         Is created; removing it is the owner's part.
     columns : tuple of Column
         ``xyz`` first, then what the attributes need.
+    blocks : list of Block, optional
+        Those that the file at `path` holds already; without them it begins empty.
     """
 
-    def __init__(self, path: Path, columns: tuple[Column, ...]) -> None:
+    def __init__(self, path: Path, columns: tuple[Column, ...], blocks: list[Block] | None = None) -> None:
         self.columns = columns
-        self.blocks: list[Block] = []
-        self.samples = 0
-        self._length = 0
-        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+        self.blocks = blocks or []
+        self.samples = sum(block.samples for block in self.blocks)
+        self._length = sum(column.itemsize for column in columns) * self.samples
+        fresh = 0 if blocks else os.O_TRUNC
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | fresh | os.O_CLOEXEC, 0o600)
 
     def append(self, values: Mapping[str, NDArray[Any]]) -> None:
         """Add a block of samples."""
@@ -86,6 +89,10 @@ class Spool:
                 values[column.name] = data
             offset += column.itemsize * block.samples
         return values
+
+    def cut(self, block: Block) -> None:
+        """Give back the room of a block and of all after it; they cannot be read again."""
+        os.truncate(self._file, block.offset)
 
     def close(self) -> None:
         """Close the file; twice is fine."""

@@ -58,6 +58,29 @@ class Survey:
     left_out: dict[str, str]
     rejected: dict[str, int]
 
+    def to_json(self) -> dict[str, Any]:
+        """Give everything as plain values; numbers keep all their bits."""
+        return {
+            "box": [self.low.tolist(), self.high.tolist()],
+            "schema": [attribute.to_json() for attribute in self.schema],
+            "constants": {name: constant.to_json() for name, constant in self.constants.items()},
+            "left_out": self.left_out,
+            "rejected": self.rejected,
+        }
+
+    @classmethod
+    def from_json(cls, entry: dict[str, Any]) -> Survey:
+        """Inverse of `to_json`."""
+        low, high = np.array(entry["box"])
+        return cls(
+            low,
+            high,
+            tuple(Attribute.from_json(attribute) for attribute in entry["schema"]),
+            {name: Constant.from_json(constant) for name, constant in entry["constants"].items()},
+            entry["left_out"],
+            entry["rejected"],
+        )
+
 
 def columns_of(attributes: dict[str, np.dtype[Any]]) -> tuple[Column, ...]:
     """Columns of the spool: positions as they came, normals as codes, everything else as it came."""

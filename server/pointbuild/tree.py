@@ -51,6 +51,10 @@ class Tree:
     def __len__(self) -> int:
         return len(self.parent)
 
+    def table(self) -> NDArray[np.int64]:
+        """(7, n): what `Tree` is called with."""
+        return np.stack([self.parent, self.half, self.depth, self.low, self.high, self.subtree, self.samples])
+
 
 def grow(
     cells: Cells,

@@ -1,11 +1,9 @@
-"""The file: header, pages and clouds, written beside its name, made durable, then renamed."""
+"""The file: header, pages and clouds, written under another name, made durable, then renamed."""
 
 from __future__ import annotations
 
 import os
-import tempfile
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from lpc.errors import BuildError
@@ -13,6 +11,7 @@ from lpc.page import pack_pages
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -21,19 +20,21 @@ if TYPE_CHECKING:
 _COPY = 1 << 20
 
 
-def write_model(out: Path, header: Header, records: NDArray[Any], clouds: BinaryIO) -> None:
+def write_model(out: Path, part: Path, header: Header, records: NDArray[Any], clouds: BinaryIO) -> None:
     """Write a model; a file of that name is replaced at the end and at once, or not at all.
 
     Parameters
     ----------
     out : Path
+    part : Path
+        The file's name until it is whole; on the same disk.
     header : Header
         Sealed.
     records : ndarray, (nodes,) RECORD
     clouds : binary file
         All clouds in the order of the nodes, without gaps; read from its start.
     """
-    with replacing(out) as file:
+    with replacing(out, part) as file:
         file.write(header.to_bytes())
         clouds.seek(0)
         for number, (_, page) in enumerate(pack_pages(header.tag, records, header.page_nodes, header.page0)):
@@ -43,18 +44,13 @@ def write_model(out: Path, header: Header, records: NDArray[Any], clouds: Binary
 
 
 @contextmanager
-def replacing(out: Path) -> Iterator[BinaryIO]:
-    """Give a new file that takes the name `out` when the block ends well, and vanishes when it does not."""
-    handle, name = tempfile.mkstemp(prefix=f".{out.name}.", suffix=".part", dir=out.parent)
-    part = Path(name)
+def replacing(out: Path, part: Path) -> Iterator[BinaryIO]:
+    """Give a new file `part` that takes the name `out` when the block ends well, and vanishes when it does not."""
     try:
-        with os.fdopen(handle, "wb") as file:
+        with part.open("wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        umask = os.umask(0)
-        os.umask(umask)
-        part.chmod(0o666 & ~umask)
         part.replace(out)
     except BaseException:
         part.unlink(missing_ok=True)

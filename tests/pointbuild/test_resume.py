@@ -1,0 +1,287 @@
+"""A build that is killed leaves no half model, and the next one goes on from there to the same bytes."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from oracles import surfaces
+
+import pointbuild.build
+import pointbuild.divide
+import pointbuild.publish
+from lpc.errors import BuildError
+from pointbuild import BuildOptions, build_model
+from pointbuild import folder as folder_module
+from pointbuild.journal import Journal, as_array, from_array
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+MOMENTS = 20
+
+# Children die by SIGKILL at their n-th call of the system that may change a file, whichever thread makes it. So moments
+# are spread over the whole build, and the same in every run of one thread. Arguments: the scan, then a folder, a
+# moment (0: never) and a number of threads for each child; one line for each says how it ended and how many calls
+# it had made.
+DYING_BUILDS = """
+import os, pathlib, signal, sys, time
+from pointbuild import BuildOptions, build_model
+from pointbuild import build
+
+calls = moment = 0
+
+def dying(function):
+    def call(*arguments, **named):
+        global calls
+        calls += 1
+        if calls == moment:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return function(*arguments, **named)
+    return call
+
+build.kernels_are_loaded = lambda: True  # no small build before: its calls would be counted
+for place, names in (
+    (os, ("pwrite", "truncate", "rename", "replace", "unlink", "fsync", "mkdir")),
+    (pathlib.Path, ("open", "rename", "replace", "unlink", "mkdir")),
+):
+    for name in names:
+        setattr(place, name, dying(getattr(place, name)))
+scan, rest = sys.argv[1], sys.argv[2:]
+for folder, when, threads in zip(rest[::3], rest[1::3], rest[2::3]):
+    told, tell = os.pipe()
+    child = os.fork()
+    if not child:
+        moment = int(when)
+        options = BuildOptions(cloud_size=64, bucket_samples=700, block_samples=900, threads=int(threads))
+        build_model([scan], pathlib.Path(folder, "m.lpc"), options, clock=time.monotonic)
+        os.write(tell, str(calls).encode())
+        os._exit(0)
+    os.close(tell)
+    print(os.waitpid(child, 0)[1], os.read(told, 99).decode() or "killed", flush=True)
+"""
+
+
+def run(scan: Path, *arguments: object) -> list[list[str]]:
+    """Exit status and number of calls of each child."""
+    paths = os.pathsep.join(str(REPOSITORY / part) for part in ("common", "server"))
+    done = subprocess.run(
+        [sys.executable, "-c", DYING_BUILDS, str(scan), *map(str, arguments)],
+        env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    return [line.split() for line in done.stdout.splitlines()]
+
+
+def digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Seven buckets, a pile that has one of its own, and an outlier that makes more than one sweep necessary."""
+    points = surfaces.bumpy(4000, seed=1, color=True)
+    xyz = np.concatenate([points.xyz * 1e-3, np.full((1000, 3), 2e-4), [[500.0, 0.0, 0.0]]])
+    color = np.concatenate([points.attributes["color"], np.arange(3003, dtype=np.uint8).reshape(1001, 3) % 251])
+    path = tmp_path_factory.mktemp("scan") / "scan.npz"
+    order = np.random.default_rng(0).permutation(len(xyz))
+    np.savez(path, xyz=xyz[order], color=color[order])
+    return path
+
+
+def options(threads: int = 1) -> BuildOptions:
+    return BuildOptions(cloud_size=64, bucket_samples=700, block_samples=900, threads=threads)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(scan: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Build once, with all kernels loaded for the children; the digest of the model."""
+    out = tmp_path_factory.mktemp("whole") / "m.lpc"
+    build_model([scan], out, options(), clock=time.monotonic)
+    return digest(out)
+
+
+def test_killed_at_twenty_moments(scan: Path, undisturbed: str, tmp_path: Path) -> None:
+    ((status, count),) = run(scan, tmp_path, 0, 1)
+    assert status == "0"
+    assert digest(tmp_path / "m.lpc") == undisturbed
+    calls = int(count)
+    assert calls > 100
+    moments = sorted(np.random.default_rng(5).choice(np.arange(1, calls + 1), MOMENTS, replace=False).tolist())
+    folders = [tmp_path / str(moment) for moment in moments]
+    for folder in folders:
+        folder.mkdir()
+        (folder / "m.lpc").write_bytes(b"an older model")
+    threads = [1 + number % 2 for number in range(MOMENTS)]
+    ends = run(scan, *(part for entry in zip(folders, moments, threads, strict=True) for part in entry))
+    assert ends == [[str(int(signal.SIGKILL)), "killed"]] * MOMENTS
+    resumed = 0
+    for folder, moment, count in zip(folders, moments, threads, strict=True):
+        out = folder / "m.lpc"
+        assert out.read_bytes() == b"an older model" or digest(out) == undisturbed
+        told: list[str] = []
+        build_model([scan], out, options(count), clock=time.monotonic, tell=told.append)
+        assert digest(out) == undisturbed, f"killed at call {moment} of {calls}"
+        assert [path.name for path in folder.iterdir()] == ["m.lpc"]
+        resumed += any("going on" in text for text in told)
+    assert resumed >= MOMENTS - 3  # before the manifest is written, and after it is removed, there is nothing to go on
+
+
+class Stages:
+    """Keeps how many samples each stage was asked for after what had been recalled."""
+
+    def __init__(self) -> None:
+        self.steps: dict[str, list[int]] = {}
+
+    def stage(self, name: str, total: int | None) -> None:
+        self.name = name
+        self.steps[name] = []
+
+    def advance(self, samples: int) -> None:
+        self.steps[self.name].append(samples)
+
+
+class KilledError(BaseException):
+    """Ends a build as abruptly as can be inside a process; its folder is copied away before it is removed."""
+
+
+class Killing(Stages):
+    """Keeps the folder of a build as it is when a stage has advanced so often."""
+
+    def __init__(self, folder: Path, stage: str, steps: int) -> None:
+        super().__init__()
+        self.folder, self.last, self.wanted = folder, stage, steps
+
+    def advance(self, samples: int) -> None:
+        super().advance(samples)
+        if self.name == self.last and len(self.steps[self.name]) == self.wanted:
+            shutil.copytree(self.folder / ".m.lpc.build", self.folder / "kept")
+            raise KilledError
+
+
+def stopped(scan: Path, folder: Path, stage: str, steps: int) -> None:
+    """Leave in `folder` what a build that is killed then leaves."""
+    with pytest.raises(KilledError):
+        build_model([scan], folder / "m.lpc", options(), Killing(folder, stage, steps), clock=time.monotonic)
+    (folder / "kept").rename(folder / ".m.lpc.build")
+
+
+@pytest.mark.parametrize(
+    ("stage", "steps", "untouched"),
+    [("scatter", 3, ["read", "count"]), ("partition", 4, ["read", "count", "scatter"]),
+     ("encode", 1, ["read", "count", "scatter", "partition"])],
+)  # fmt: skip
+def test_what_was_done_is_not_done_again(
+    stage: str, steps: int, untouched: list[str], scan: Path, undisturbed: str, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    stopped(scan, tmp_path, stage, steps)
+    done: list[str] = []
+
+    def noting(module: Any, name: str) -> None:
+        function = getattr(module, name)
+
+        def noted(*arguments: Any, **named: Any) -> Any:
+            done.append(name)
+            return function(*arguments, **named)
+
+        monkeypatch.setattr(module, name, noted)
+
+    noting(pointbuild.build, "survey")
+    for name in ("scatter", "partition"):
+        noting(pointbuild.divide, name)
+    noting(pointbuild.publish, "encode_run")
+    build_model([scan], tmp_path / "m.lpc", options(), clock=time.monotonic)
+    assert digest(tmp_path / "m.lpc") == undisturbed
+    names = {"read": "survey", "scatter": "scatter", "partition": "partition"}
+    assert not {names.get(name) for name in untouched} & set(done)
+    if stage == "partition":
+        whole = Stages()
+        build_model([scan], tmp_path / "n.lpc", options(), whole, clock=time.monotonic)
+        assert done.count("partition") == 2 * len(whole.steps["partition"]) - steps
+
+
+@pytest.mark.parametrize("what", ["seed", "scan", "version", "restart", "torn"])
+def test_files_of_another_build_are_not_gone_on_with(
+    what: str, scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mine = tmp_path / "scan.npz"
+    shutil.copy(scan, mine)
+    stopped(mine, tmp_path, "partition", 2)
+    chosen = options()
+    if what == "seed":
+        chosen = replace(chosen, seed=1)
+    elif what == "scan":
+        np.savez(mine, xyz=surfaces.bumpy(900, seed=9).xyz)
+    elif what == "version":
+        monkeypatch.setattr(folder_module, "LAYOUT", 0)
+    elif what == "restart":
+        monkeypatch.setattr(folder_module, "_system_start", lambda: "another")
+    else:
+        (tmp_path / ".m.lpc.build" / "manifest.json").write_text('{"inputs"')
+    told: list[str] = []
+    build_model([mine], tmp_path / "m.lpc", chosen, clock=time.monotonic, tell=told.append)
+    assert ["starting over" in text for text in told] == ([] if what == "torn" else [True])
+    build_model([mine], tmp_path / "n.lpc", chosen, clock=time.monotonic)
+    assert digest(tmp_path / "m.lpc") == digest(tmp_path / "n.lpc")
+
+
+def test_a_second_build_of_the_same_model_is_refused(scan: Path, tmp_path: Path) -> None:
+    out = tmp_path / "m.lpc"
+
+    class Meddling(Stages):
+        def stage(self, name: str, total: int | None) -> None:
+            super().stage(name, total)
+            if name == "partition":
+                with pytest.raises(BuildError, match=r"another build of .*m\.lpc is running"):
+                    build_model([scan], out, options(), clock=time.monotonic)
+                build_model([scan], tmp_path / "other.lpc", options(), clock=time.monotonic)
+
+    build_model([scan], out, options(), Meddling(), clock=time.monotonic)
+    assert digest(out) == digest(tmp_path / "other.lpc")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["m.lpc", "other.lpc"]
+
+
+def test_models_of_one_name_share_a_scratch_directory(scan: Path, tmp_path: Path) -> None:
+    for name in ("a", "b", "scratch"):
+        (tmp_path / name).mkdir()
+    chosen = replace(options(), scratch=tmp_path / "scratch")
+
+    class Meddling(Stages):
+        def stage(self, name: str, total: int | None) -> None:
+            super().stage(name, total)
+            if name == "encode":
+                build_model([scan], tmp_path / "b" / "m.lpc", chosen, clock=time.monotonic)
+
+    build_model([scan], tmp_path / "a" / "m.lpc", chosen, Meddling(), clock=time.monotonic)
+    assert digest(tmp_path / "a" / "m.lpc") == digest(tmp_path / "b" / "m.lpc")
+    assert list((tmp_path / "scratch").iterdir()) == []
+
+
+def test_a_torn_entry_of_a_journal_was_never_there(tmp_path: Path) -> None:
+    path = tmp_path / "some.journal"
+    journal = Journal(path)
+    assert list(journal) == []
+    journal.add(np.arange(5), as_array({"a": [1.5, None]}))
+    first = path.stat().st_size
+    journal.add(np.zeros((2, 0)), np.array(3.0))
+    data = path.read_bytes()
+    for end in range(first, len(data)):
+        path.write_bytes(data[:end])
+        again = Journal(path)
+        assert again.entries == 1
+        assert path.stat().st_size == first
+    path.write_bytes(data[:-1] + b"\xff")
+    assert Journal(path).entries == 1
+    path.write_bytes(data)
+    (numbers, told), (empty, three) = list(Journal(path))
+    assert numbers.tolist() == [0, 1, 2, 3, 4]
+    assert from_array(told) == {"a": [1.5, None]}
+    assert (empty.shape, float(three)) == ((2, 0), 3.0)
