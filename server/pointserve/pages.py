@@ -41,7 +41,7 @@ def catalogue_page(entries: Iterable[Entry], origin: str, *, query: str = "") ->
     shown = list(entries)
     models = [entry for entry in shown if entry.header is not None]
     samples = sum(entry.header.samples for entry in models if entry.header is not None)
-    summary = f"{len(models)} model{'' if len(models) == 1 else 's'}, {count(samples)} samples"
+    summary = f"{_some(len(models), 'model')}, {count(samples)} samples"
     suffix = f"?{query}" if query else ""
     articles = (
         "\n".join(_article(entry, origin, suffix) for entry in shown) or "<p>No models are in this folder yet.</p>"
@@ -75,7 +75,7 @@ def _facts(entry: Entry) -> list[tuple[str, str]]:
     attributes = [attribute.name for attribute in header.attributes] + sorted(header.constants)
     bits = header.bits_per_sample.get("total", 8 * header.bytes / header.samples)
     facts = [
-        ("samples", f"{count(header.samples)} in {count(header.nodes)} clouds, {header.levels} levels"),
+        ("samples", f"{count(header.samples)} in {_some(header.nodes, 'cloud')}, {_some(header.levels, 'level')}"),
         ("size", f"{byte_size(entry.size)}, {bits:.1f} bits a sample"),
         ("attributes", ", ".join(attributes) or "none"),
         ("extent", f"{size}, spacing {header.spacing:.3g}, error at most {header.position_error:.2g}"),
@@ -103,6 +103,10 @@ def crs_name(wkt: str | None) -> str | None:
 def count(number: int) -> str:
     """Return a number with groups of three digits set apart."""
     return f"{number:,}".replace(",", "\u202f")
+
+
+def _some(number: int, noun: str) -> str:
+    return f"{count(number)} {noun}{'' if number == 1 else 's'}"
 
 
 def byte_size(number: int) -> str:

@@ -259,6 +259,26 @@ def test_workers_share_the_port_come_back_and_stop_together(models: Path, model:
     assert not any(Path(f"/proc/{worker}").exists() for worker in now)
 
 
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_a_stop_waits_no_longer_than_its_grace(models: Path, model: WriteModel, workers: str) -> None:
+    model(size=40_000_000)
+
+    async def stop_while_stalled() -> None:
+        async with RawConnection(url) as stalled:
+            stalled.writer.write(b"GET /david.lpc HTTP/1.1\r\nHost: t\r\n\r\n")
+            await stalled.read_head()
+            process.send_signal(signal.SIGTERM)
+            await asyncio.to_thread(process.wait, 20)
+
+    with serve_in_process(models, "--workers", workers, "--grace", "0.3", "--log", "json") as (url, process):
+        asyncio.run(stop_while_stalled())
+        _, log = process.communicate(timeout=20)
+    assert process.returncode == 0
+    (line,) = [json.loads(line) for line in log.splitlines()]
+    assert line["cut"]
+    assert 0 < line["bytes"] < 40_000_000
+
+
 def test_workers_leave_when_their_supervisor_is_killed(models: Path, model: WriteModel) -> None:
     model()
     with serve_in_process(models, "--workers", "2", "--quiet") as (_, process):

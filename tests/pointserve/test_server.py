@@ -153,6 +153,24 @@ async def test_five_gigabytes(models: Path) -> None:
         assert (await connection.ask("/huge.lpc", "Range: bytes=-4")).body == b"\6\0\0\0"
 
 
+async def test_files_of_no_and_of_one_byte(models: Path) -> None:
+    (models / "none.lpc").write_bytes(b"")
+    (models / "one.lpc").write_bytes(b"1")
+    async with serve_in_loop(models) as url, RawConnection(url) as connection:
+        for name, wanted, status, body, content_range in (
+            ("none", None, 200, b"", None),
+            ("none", "bytes=0-", 416, None, "bytes */0"),
+            ("none", "bytes=-5", 200, b"", None),
+            ("one", "bytes=0-", 206, b"1", "bytes 0-0/1"),
+            ("one", "bytes=-9", 206, b"1", "bytes 0-0/1"),
+            ("one", "bytes=-0", 416, None, "bytes */1"),
+            ("one", "bytes=0-0,0-0", 206, b"1", "bytes 0-0/1"),
+        ):
+            reply = await connection.ask(f"/{name}.lpc", *([f"Range: {wanted}"] if wanted else []))
+            assert (reply.status, reply.headers.get("content-range")) == (status, content_range)
+            assert body is None or reply.body == body
+
+
 async def slow_connection(url: str, target: str, *, behind: str | None = None) -> RawConnection:
     """Ask, read only the head, and leave the rest where it is: small buffers keep nearly all of it at the server."""
     connection = RawConnection(url)
