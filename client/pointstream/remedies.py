@@ -73,11 +73,17 @@ aws s3api put-bucket-cors --bucket BUCKET --cors-configuration '{"CORSRules": [{
     "ExposeHeaders": ["Accept-Ranges", "Content-Range", "ETag"], "MaxAgeSeconds": 86400}]}'
 """
 
+OURS = """
+pointstream serve /srv/models --cors "*"
+"""
+
 RECIPES: Mapping[str, str] = {"nginx": NGINX, "Apache": APACHE, "Caddy": CADDY, "S3-compatible stores": S3}
 """Lines by kind of host."""
 
+_ALL = {**RECIPES, "pointstream": OURS}
+
 _KNOWN = {
-    "nginx": "nginx", "openresty": "nginx", "apache": "Apache", "caddy": "Caddy",
+    "pointstream": "pointstream", "nginx": "nginx", "openresty": "nginx", "apache": "Apache", "caddy": "Caddy",
     "amazons3": "S3-compatible stores", "minio": "S3-compatible stores", "ceph": "S3-compatible stores",
 }  # fmt: skip
 
@@ -86,4 +92,4 @@ def recipes_for(server: str | None) -> Mapping[str, str]:
     """Recipes of the host that a Server field names; all of them where it names none that we know."""
     named = (server or "").lower()
     kind = next((kind for word, kind in _KNOWN.items() if word in named), None)
-    return RECIPES if kind is None else {kind: RECIPES[kind]}
+    return RECIPES if kind is None else {kind: _ALL[kind]}

@@ -136,6 +136,7 @@ def test_what_was_not_measured_is_said() -> None:
 def test_recipes_follow_the_host() -> None:
     assert list(recipes_for("nginx/1.22.1")) == ["nginx"]
     assert list(recipes_for("AmazonS3")) == ["S3-compatible stores"]
+    assert "--cors" in recipes_for("pointstream")["pointstream"]
     assert recipes_for("unheard of") == recipes_for(None) == RECIPES
 
 
