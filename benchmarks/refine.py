@@ -51,7 +51,7 @@ def sphere_index() -> Any:
     children[children >= nodes] = -1
     levels = np.concatenate(level)
     return SimpleNamespace(
-        header=SimpleNamespace(nodes=nodes, page_nodes=1024),
+        header=SimpleNamespace(nodes=nodes, page_nodes=1024, bounds=(-1, -1, -1, 1, 1, 1)),
         known=np.ones(nodes, dtype=bool),
         center=np.concatenate(center),
         radius=np.concatenate(radius),

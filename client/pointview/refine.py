@@ -9,8 +9,8 @@ array of node numbers and every test below is one numpy expression over it.
    sphere nearest to the eye; infinite where the eye is inside. Below the tolerance the node is fine enough.
 3. Otherwise its children refine it: one whose record is unknown makes its page wanted; one that is not resident is
    wanted itself; one that is resident is visited. A node with a visible child that cannot be drawn yet is *starved*.
-4. Splats show the spacing of the deepest drawn region they lie in: a fine or starved node's own, a refined node's
-   the largest of its drawn children. So there are no holes where data is missing and no fat where it is not.
+4. Splats show the spacing of the deepest drawn node at their place (`places`): no holes where data is missing, and no
+   fat beside it. LPC's plain rule, one size a cloud, is there for comparison.
 
 Nothing here does I/O or reads a clock; equal arguments give equal cuts.
 """
@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from .places import Places, places
 from .splats import CLOSING, LARGEST
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 
 Nodes = NDArray[np.int64]
 Priority = Literal["index", "error"]
+SplatRule = Literal["place", "paper"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,7 +56,7 @@ class Cut:
     nodes : (n,) int64
         Nodes to draw, ascending: coarse to fine, and near in space when near in the array.
     spacing : (n,) float32
-        Spacing that the node's splats must close, model units.
+        Largest spacing that splats of the node must close, model units.
     splat_px : (n,) float32
         Side of a splat at the point of the node's sphere nearest to the eye, pixels; samples further away get less.
     starved : (n,) bool
@@ -69,6 +71,8 @@ class Cut:
     max_spacing_px : float
         Largest projected spacing of a node that is not refined, pixels, at most the larger side of the picture: how
         coarse the picture is at its worst place. 0 for an empty cut.
+    places : Places or None
+        Spacing at each place; None: all splats of a node close its `spacing`.
     depth_range : (near, far)
         Depths between which all samples in front of the eye lie, 0 < near < far; far follows from the nodes, near is at
         least a millionth of it.
@@ -83,6 +87,7 @@ class Cut:
     culled: Culled
     splats: int
     max_spacing_px: float
+    places: Places | None
     depth_range: tuple[float, float]
 
 
@@ -164,6 +169,7 @@ def refine(
     *,
     priority: Priority = "index",
     cull_backfaces: bool = True,
+    splat_rule: SplatRule = "place",
 ) -> Cut:
     """Compute the cut of one frame.
 
@@ -178,6 +184,9 @@ def refine(
         removes.
     cull_backfaces : bool
         False where the normals cannot be trusted to point outward.
+    splat_rule : {"place", "paper"}
+        What a splat's size follows: the deepest drawn node at its place, or, as in LPC 4, the cloud: the spacing of its
+        node where that is starved or fine enough, the tolerance where it is refined.
 
     Notes
     -----
@@ -193,12 +202,20 @@ def refine(
     if not levels:
         return _empty(wants=[], pages=[], culled=_culled(sieve))
 
-    shown = _shown_spacing(index, levels)
+    own = [index.spacing[level.nodes] for level in levels]
+    shown = _shown_spacing(levels, own)
     nodes = np.concatenate([level.nodes for level in levels])
     spacing_px = np.concatenate([level.spacing_px for level in levels])
     starved = np.concatenate([level.missing.any(axis=1) for level in levels])
     ends = starved | np.concatenate([(level.children < 0).all(axis=1) for level in levels])
-    spacing = np.concatenate(shown)
+    if splat_rule == "paper":
+        spacing = np.concatenate(own) * np.where(ends, 1.0, np.minimum(tolerance / spacing_px, 1.0))
+        laid_out = None
+    else:
+        spacing = np.concatenate(shown)
+        laid_out = places(
+            index.header, [level.drawn for level in levels], [level.missing for level in levels], own, shown
+        )
     # A splat at the nearest point of the sphere; without bound but the largest where the eye is inside it.
     splat_px = np.ones(len(nodes))
     grown = spacing > 0
@@ -214,6 +231,7 @@ def refine(
         culled=_culled(sieve),
         splats=int(index.samples[nodes].sum()),
         max_spacing_px=min(float(np.max(spacing_px[ends], initial=0.0)), float(max(camera.width, camera.height))),
+        places=laid_out,
         depth_range=camera.depth_range(index.center[nodes], index.radius[nodes]),
     )
 
@@ -247,12 +265,11 @@ def drawn_up_to(
     return np.concatenate(limits), np.concatenate(samples)
 
 
-def _shown_spacing(index: IndexTree, levels: list[_Level]) -> list[NDArray[np.float64]]:
-    """Spacing of the drawn region around each node's samples, bottom up, model units."""
+def _shown_spacing(levels: list[_Level], spacings: list[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+    """Largest spacing of the drawn regions around each node's samples, bottom up, model units."""
     shown: list[NDArray[np.float64]] = []
     below: NDArray[np.float64] = np.empty(0)
-    for level in reversed(levels):
-        own = index.spacing[level.nodes]
+    for level, own in zip(reversed(levels), reversed(spacings), strict=True):
         largest = np.zeros(level.drawn.shape)
         largest[level.drawn] = below
         largest = largest.max(axis=1)
@@ -307,5 +324,6 @@ def _empty(*, wants: list[int], pages: list[int], culled: Culled) -> Cut:
         culled=culled,
         splats=0,
         max_spacing_px=0.0,
+        places=None,
         depth_range=(1.0, 2.0),
     )

@@ -36,9 +36,12 @@ LARGEST = 160.0
 """No splat has a larger side, pixels: its disc stays within 255, the least that OpenGL implementations allow, even
 where the perspective stretches it at the rim of the picture."""
 
-HOLE = 1.0
+HOLE = 1.5
 """Widest half of a gap that is taken for a hole of the sampling, sides of the splats around it. Random samples leave
 one gap or other at any density, and no scan is evenly dense; what fits into such a gap is no detail of the model."""
+
+REACH = 1.0
+"""A sample this near to a coarser cell, in spacings of that cell, helps to close it (`places`)."""
 
 LARGEST_HOLE = 64
 """And in pixels."""

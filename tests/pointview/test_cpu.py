@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support import models
+from support import models, placed
 
 from lpc.octahedral import decode_normals
 from pointview import splats
@@ -31,7 +31,8 @@ def paint(model, cut, camera, *, cull, oriented):
     column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     ray = np.stack([(column - camera.width / 2), (camera.height / 2 - row)], axis=-1) / camera.focal
     ray = np.concatenate([ray, np.ones((*depth.shape, 1))], axis=-1)
-    for number, spacing in zip(cut.nodes.tolist(), cut.spacing.tolist(), strict=True):
+    walk = placed.Walk(model, cut)
+    for number in cut.nodes.tolist():
         xyz = model.positions(number)
         pixel, z = camera.project(xyz)
         inside = camera.to_camera(xyz)
@@ -39,6 +40,7 @@ def paint(model, cut, camera, *, cull, oriented):
         for i in range(len(xyz)):
             if z[i] <= 0 or (cull and normals[i] @ (xyz[i] - camera.eye) > 0):
                 continue
+            spacing = walk.at(number, xyz[i])[0] if cut.places is not None else walk.spacing[number]
             side = min(splats.CLOSING * spacing * camera.focal / z[i], splats.LARGEST)
             dx, dy = column - pixel[i, 0], row - pixel[i, 1]
             here = behind = np.full(depth.shape, z[i])
@@ -92,7 +94,7 @@ def test_holes_are_closed_by_the_wall_around_them_and_nothing_else_is():
     model = models.sphere(3000, cloud_size=100)
     camera = camera_at((0, -3, 1), width=120, height=120)
     cut = refine(model.index, camera, 1.0, model.everything)
-    cut = replace(cut, spacing=cut.spacing * 0.6)  # too small to close the surface
+    cut = replace(cut, spacing=cut.spacing * 0.6, places=None)  # too small to close the surface
     backend = CpuBackend(model.header)
     before = backend.draw(cut, model.take, camera, Style(close_holes=False))
     after = backend.draw(cut, model.take, camera, Style())
@@ -266,7 +268,11 @@ def test_starved_pixels_are_tinted(tmp_path):
     cut = refine(model.index, camera, 1.0, model.first(6))
     frame = CpuBackend(model.header).draw(cut, model.take, camera, Style())
     where = frame.starved
-    np.testing.assert_array_equal(where, np.isin(frame.node, cut.nodes[cut.starved]))
+    walk = placed.Walk(model, cut)
+    one_way = {node: found[1] for node in cut.nodes.tolist() if (found := walk.deepest_everywhere(node))}
+    known = np.isin(frame.node, list(one_way))
+    np.testing.assert_array_equal(where[known], [one_way[node] for node in frame.node[known].tolist()])
+    assert not where[frame.node < 0].any()
     assert where.any()
     twin = tint_starved(frame)
     np.testing.assert_array_equal(twin[~where], frame.rgb[~where])

@@ -6,9 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-import numpy as np
-
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from lpc.cloud import Cloud
@@ -61,7 +60,7 @@ class Frame:
     node : (h, w) int32
         The node whose sample is seen; -1 where nothing was drawn.
     starved : (h, w) bool
-        Pixels whose sample belongs to a starved node: the yellow patches of LPC figure 5.
+        Pixels whose sample lies where a node is missing: the yellow patches of LPC figure 5.
     splats, clouds : int
         Samples and clouds submitted.
     uploads : int
@@ -75,13 +74,6 @@ class Frame:
     splats: int
     clouds: int
     uploads: int
-
-
-def starved_pixels(node: NDArray[np.int32], cut: Cut) -> NDArray[np.bool_]:
-    """Which pixels of a `Frame.node` show a starved node of the cut it was drawn from."""
-    starved = np.zeros(int(cut.nodes[-1]) + 2 if len(cut.nodes) else 1, dtype=bool)
-    starved[cut.nodes] = cut.starved
-    return starved[node]  # -1 is the last entry, false
 
 
 class Backend(Protocol):

@@ -15,7 +15,7 @@ from pointview import splats
 
 from . import kernels, shading
 from .arena import Arena
-from .backend import Frame, Style, Take, starved_pixels
+from .backend import Frame, Style, Take
 from .pack import Packer
 
 if TYPE_CHECKING:
@@ -59,11 +59,13 @@ class CpuBackend:
         if self._layers.shape[1:] != shape:
             self._layers = np.empty((self._threads, *shape), dtype=np.uint64)
         clouds, cloud_of_block = self._clouds(cut, camera)
+        places, halvings = _places(cut)
         view = self._view(cut, camera, style)
         light = self._light(camera, style)
         rotation = camera.rotation().astype(np.float32)
         rgb, depth = np.empty((*shape, 3), dtype=np.uint8), np.empty(shape, dtype=np.float32)
         node, side = np.empty(shape, dtype=np.int32), np.empty(shape, dtype=np.float32)
+        starved = np.empty(shape, dtype=bool)
         source = np.empty(shape, dtype=np.int32)
         surface = (255, 255, 255) if self._packer.has_colors else style.surface
         albedo = np.array(surface, dtype=np.float32) / np.float32(255)
@@ -73,15 +75,15 @@ class CpuBackend:
             self._layers[worker] = kernels.EMPTY
             # Every `threads`-th cloud: neighbours in the array are neighbours in space, and cost alike.
             mine = np.ascontiguousarray(clouds[worker :: self._threads])
-            kernels.splat(self._layers[worker], self._vertex, mine, rotation, view)
+            kernels.splat(self._layers[worker], self._vertex, mine, places, halvings, rotation, view)
 
         def rows(worker: int) -> tuple[int, int]:
             return camera.height * worker // self._threads, camera.height * (worker + 1) // self._threads
 
         def resolve(worker: int) -> None:
             kernels.resolve(
-                self._layers, *rows(worker), rgb, depth, node, side, self._vertex, self._color, clouds, cloud_of_block,
-                rotation, view, light, albedo, background,
+                self._layers, *rows(worker), rgb, depth, node, side, starved, self._vertex, self._color, clouds,
+                cloud_of_block, places, halvings, rotation, view, light, albedo, background,
             )  # fmt: skip
 
         def dim(worker: int) -> None:
@@ -98,7 +100,7 @@ class CpuBackend:
             self._in_parallel(close)
             holes = np.flatnonzero(source != np.arange(source.size, dtype=np.int32).reshape(shape))
             walls = source.ravel()[holes]
-            for image in (rgb.reshape(-1, 3), depth.ravel(), node.ravel(), side.ravel()):
+            for image in (rgb.reshape(-1, 3), depth.ravel(), node.ravel(), side.ravel(), starved.ravel()):
                 image[holes] = image[walls]
         if not self._packer.has_normals and style.edl_strength > 0:
             self._in_parallel(dim)
@@ -106,7 +108,7 @@ class CpuBackend:
             rgb=rgb,
             depth=depth,
             node=node,
-            starved=starved_pixels(node, cut),
+            starved=starved,
             splats=cut.splats,
             clouds=len(cut.nodes),
             uploads=uploads,
@@ -147,7 +149,12 @@ class CpuBackend:
         offset = self._arena.origin[slots] - np.array(camera.eye)
         clouds["x"], clouds["y"], clouds["z"] = offset.T
         clouds["scale"] = self._arena.scale[slots]
-        clouds["side"] = cut.spacing * (splats.CLOSING * camera.focal)
+        clouds["spacing"], clouds["starved"] = cut.spacing, cut.starved
+        clouds["row"], clouds["level"] = np.arange(len(slots)), -1
+        if cut.places is not None:
+            clouds["level"] = cut.places.level
+            corner = self._arena.origin[slots] - cut.places.corner
+            clouds["corner_x"], clouds["corner_y"], clouds["corner_z"] = corner.T
         return clouds, np.repeat(np.arange(len(slots), dtype=np.int32), blocks)
 
     def _view(self, cut: Cut, camera: Camera, style: Style) -> Any:
@@ -156,6 +163,7 @@ class CpuBackend:
         view["near"] = cut.depth_range[0]
         view["largest"], view["round_from"], view["round"] = splats.LARGEST, splats.ROUND_FROM, splats.ROUND
         view["bulge"], view["steepest"] = splats.BULGE, splats.STEEPEST
+        view["closing"], view["reach"] = splats.CLOSING * camera.focal, splats.REACH
         view["cull"] = self._packer.has_normals and not style.two_sided
         view["oriented"] = style.oriented
         return view
@@ -174,6 +182,18 @@ class CpuBackend:
         work(0)
         for other in others:
             other.result()
+
+
+def _places(cut: Cut) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return a cut's places as the kernels read them."""
+    if cut.places is None:
+        return np.empty(0, dtype=kernels.PLACE), np.empty(0, dtype=kernels.HALVING)
+    places = np.empty(len(cut.nodes), dtype=kernels.PLACE)
+    places["lower"], places["upper"] = cut.places.link.T
+    places["lower_spacing"], places["upper_spacing"] = cut.places.spacing.T
+    halvings = np.empty(len(cut.places.axis), dtype=kernels.HALVING)
+    halvings["axis"], halvings["half"] = cut.places.axis, cut.places.half
+    return places, halvings
 
 
 def _grown(array: NDArray[Any], rows: int) -> NDArray[Any]:

@@ -23,7 +23,7 @@ from pointview import splats
 
 from . import shading
 from .arena import Arena
-from .backend import Frame, Style, Take, starved_pixels
+from .backend import Frame, Style, Take
 from .pack import SAMPLE_BYTES, Packer
 
 if TYPE_CHECKING:
@@ -40,10 +40,22 @@ COMMANDS_FROM = 430
 EMPTY = float(np.finfo(np.float32).max)
 """Depth of a pixel without sample on the GPU, which need not know infinity."""
 
+PLACES_UNIT = 7
+"""Texture unit; the passes over the picture use the first ones."""
+
 COMMAND = np.dtype([(name, "<u4") for name in ("count", "instances", "first", "base_instance", "padding")])
 """glMultiDrawArraysIndirect's command, padded: moderngl steps 20 bytes from one to the next."""
 
-PLACEMENT = np.dtype([("offset", "<f4", 3), ("placement", "<f4", 2), ("node", "<i4")])
+PLACEMENT = np.dtype(
+    [("offset", "<f4", 3), ("placement", "<f4", 2), ("corner", "<f4", 3), ("node", "<i4"), ("place", "<i4", 2)]
+)
+"""What a draw of one cloud is told; see the vertex shader."""
+
+STARVED = 1 << 30
+"""Added to the row of a node that is starved everywhere."""
+
+PLACES_WIDTH = 1024
+"""Texels in a row of the texture of places: first one for each level, then one for each drawn node."""
 
 
 class GlBackend:
@@ -89,11 +101,12 @@ class GlBackend:
         self._resize(camera.width, camera.height)
         self._clear(style)
         self._begin_splats(cut, camera, style)
+        self._write_places(cut)
         uploads = 0
         for start in range(0, len(cut.nodes), self._arena.slots):
             part = slice(start, start + self._arena.slots)
             uploads += self._upload(cut.nodes[part], take)
-            self._submit(cut.nodes[part], cut.spacing[part], camera)
+            self._submit(cut, part, camera)
         layers = self._splatted
         if style.close_holes:
             layers = self._close_holes(layers, camera)
@@ -118,7 +131,7 @@ class GlBackend:
         if self._one_draw:
             self._placements = context.buffer(reserve=slots * PLACEMENT.itemsize)
             self._commands = context.buffer(reserve=slots * COMMAND.itemsize)
-            content.append((self._placements, "3f 2f 1i /i", "offset", "placement", "node"))
+            content.append((self._placements, "3f 2f 3f 1i 2i /i", "offset", "placement", "corner", "node", "place"))
         self._points = context.vertex_array(self._program, content)
         self._closer, self._dimmer = (
             context.program(vertex_shader=_shader("picture.vert.glsl"), fragment_shader=_shader(name))
@@ -127,6 +140,7 @@ class GlBackend:
         self._closing = context.vertex_array(self._closer, [])
         self._dimming = context.vertex_array(self._dimmer, [])
         self._size = (0, 0)
+        self._places = context.texture((PLACES_WIDTH, 1), 4, dtype="f4")
 
     def _resize(self, width: int, height: int) -> None:
         if self._size == (width, height):
@@ -166,6 +180,8 @@ class GlBackend:
             "round_factor": splats.ROUND,
             "bulge": splats.BULGE,
             "steepest": splats.STEEPEST,
+            "reach": splats.REACH,
+            "closing": splats.CLOSING * camera.focal,
             "oriented": style.oriented,
             "albedo": tuple(channel / 255 for channel in surface),
             "lamp": tuple(shading.lamp().tolist()),
@@ -188,15 +204,39 @@ class GlBackend:
             self._arena.put(slot, packed)
         return len(absent)
 
-    def _submit(self, nodes: NDArray[np.int64], spacing: NDArray[np.float32], camera: Camera) -> None:
+    def _write_places(self, cut: Cut) -> None:
+        """Give the vertex shader the places of a cut: halvings (axis, half), then nodes (links, spacings)."""
+        if cut.places is None:
+            return
+        levels = len(cut.places.axis)
+        rows = -(-(levels + len(cut.nodes)) // PLACES_WIDTH)
+        if self._places.height < rows:
+            self._places.release()
+            self._places = self._context.texture((PLACES_WIDTH, 1 << (rows - 1).bit_length()), 4, dtype="f4")
+        texels = np.zeros((rows * PLACES_WIDTH, 4), dtype="<f4")
+        texels[:levels, 0], texels[:levels, 1] = cut.places.axis, cut.places.half
+        texels[levels : levels + len(cut.nodes), :2] = cut.places.link
+        texels[levels : levels + len(cut.nodes), 2:] = cut.places.spacing
+        self._places.write(texels, viewport=(0, 0, PLACES_WIDTH, rows))
+        self._places.use(PLACES_UNIT)
+        self._program["places"].value = PLACES_UNIT
+        self._program["levels"].value = levels
+
+    def _submit(self, cut: Cut, part: slice, camera: Camera) -> None:
         """Draw nodes that are in the arena."""
+        nodes = cut.nodes[part]
         slots = self._arena.slots_of(nodes)
         counts = self._arena.count[slots]
         placement = np.empty(len(nodes), dtype=PLACEMENT)
         placement["offset"] = self._arena.origin[slots] - np.array(camera.eye)
         placement["placement"][:, 0] = self._arena.scale[slots]
-        placement["placement"][:, 1] = spacing * (splats.CLOSING * camera.focal)
+        placement["placement"][:, 1] = cut.spacing[part] * (splats.CLOSING * camera.focal)  # with no place to look up
         placement["node"] = nodes
+        placement["place"][:, 0] = np.arange(len(cut.nodes))[part] + np.where(cut.starved[part], STARVED, 0)
+        placement["place"][:, 1] = -1
+        if cut.places is not None:
+            placement["place"][:, 1] = cut.places.level[part]
+            placement["corner"] = self._arena.origin[slots] - cut.places.corner[part]
         first = slots * self._samples
         if self._one_draw:
             commands = np.zeros(len(nodes), dtype=COMMAND)
@@ -206,12 +246,13 @@ class GlBackend:
             self._commands.write(commands)
             self._points.render_indirect(self._commands, moderngl.POINTS, len(nodes))
             return
-        offset, scale, node = (self._program[name] for name in ("offset", "placement", "node"))
-        rows = zip(placement, counts.tolist(), first.tolist(), strict=True)
-        for row, count, start in rows:
-            offset.write(row["offset"].tobytes())
-            scale.write(row["placement"].tobytes())
-            node.write(row["node"].tobytes())
+        names = PLACEMENT.names or ()
+        uniforms = [self._program[name] for name in names]
+        columns = [placement[name].tobytes() for name in names]
+        sizes = [PLACEMENT[name].itemsize for name in names]
+        for row, (count, start) in enumerate(zip(counts.tolist(), first.tolist(), strict=True)):
+            for uniform, column, size in zip(uniforms, columns, sizes, strict=True):
+                uniform.write(column[row * size : (row + 1) * size])
             self._points.render(moderngl.POINTS, vertices=count, first=start)
 
     def _close_holes(self, layers: _Layers, camera: Camera) -> _Layers:
@@ -238,7 +279,8 @@ class GlBackend:
         shape, viewport = (camera.height, camera.width), (0, 0, camera.width, camera.height)
         rgba = np.frombuffer(picture.read(viewport, components=4), dtype=np.uint8).reshape(*shape, 4)
         read = layers.target.read
-        depth = np.frombuffer(read(viewport, components=1, attachment=1, dtype="f4"), dtype="<f4").reshape(shape)[::-1]
+        depths = np.frombuffer(read(viewport, components=2, attachment=1, dtype="f4"), dtype="<f4")
+        depth, side = np.moveaxis(depths.reshape(*shape, 2)[::-1], 2, 0)
         node = np.frombuffer(read(viewport, components=1, attachment=2, dtype="i4"), dtype="<i4").reshape(shape)[::-1]
         empty = depth >= EMPTY
         node = np.where(empty, np.int32(-1), node)
@@ -246,7 +288,7 @@ class GlBackend:
             rgb=np.ascontiguousarray(rgba[::-1, :, :3]),
             depth=np.where(empty, np.float32(np.inf), depth),
             node=node,
-            starved=starved_pixels(node, cut),
+            starved=(side < 0) & ~empty,
             splats=cut.splats,
             clouds=len(cut.nodes),
             uploads=uploads,

@@ -36,10 +36,29 @@ CLOUD = np.dtype(
         ("y", np.float32),
         ("z", np.float32),
         ("scale", np.float32),  # model units of a step
-        ("side", np.float32),  # of a splat, pixels times depth
+        ("spacing", np.float32),  # to close, model units; the next five say where it differs inside the cloud
+        ("starved", np.bool_),
+        ("row", np.int32),  # of its node in PLACE
+        ("level", np.int32),  # of its node; -1 where the spacing is the same everywhere
+        ("corner_x", np.float32),  # position of the cloud's (0, 0, 0) relative to the corner of its node's cell
+        ("corner_y", np.float32),
+        ("corner_z", np.float32),
     ]
 )
 """A cloud of the frame."""
+
+PLACE = np.dtype(
+    [
+        ("lower", np.int32),  # rows of the drawn nodes in the halves of the cell; -1 where the half ends here
+        ("upper", np.int32),
+        ("lower_spacing", np.float32),  # to close there; negative where starved
+        ("upper_spacing", np.float32),
+    ]
+)
+"""A drawn node (see `places`)."""
+
+HALVING = np.dtype([("axis", np.int32), ("half", np.float32)])
+"""How the cells of a level are halved (see `places`)."""
 
 VIEW = np.dtype(
     [
@@ -47,11 +66,13 @@ VIEW = np.dtype(
         ("height", np.float32),
         ("focal", np.float32),
         ("near", np.float32),
-        ("largest", np.float32),  # side of a splat, pixels; see `splats` for this and the next four
+        ("largest", np.float32),  # side of a splat, pixels; see `splats` for this and the next six
         ("round_from", np.float32),
         ("round", np.float32),
         ("bulge", np.float32),
         ("steepest", np.float32),
+        ("closing", np.float32),  # side of a splat over the spacing to close, times the focal length
+        ("reach", np.float32),
         ("cull", np.bool_),  # drop samples whose normal points away
         ("oriented", np.bool_),  # samples with normals are discs in their tangent plane
     ]
@@ -189,10 +210,84 @@ def _ball(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def _facing(
+    row: int, level: int, x: np.float32, y: np.float32, z: np.float32, places: NDArray[Any], halvings: NDArray[Any]
+) -> np.float32:  # pragma: no cover - compiled
+    """Spacing of the cell that holds a position; the position is relative to the corner of the row's cell."""
+    while True:
+        axis, half, place = halvings[level].axis, halvings[level].half, places[row]
+        along = x if axis == 0 else (y if axis == 1 else z)
+        if along >= half:
+            row, spacing = place.upper, place.upper_spacing
+            if axis == 0:
+                x -= half
+            elif axis == 1:
+                y -= half
+            else:
+                z -= half
+        else:
+            row, spacing = place.lower, place.lower_spacing
+        if row < 0:
+            return abs(spacing)
+        level += 1
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _spacing_at(
+    cloud: Any,
+    x: np.float32,
+    y: np.float32,
+    z: np.float32,
+    reach: np.float32,
+    places: NDArray[Any],
+    halvings: NDArray[Any],
+) -> tuple[np.float32, bool]:  # pragma: no cover - compiled
+    """Spacing to close at a sample of the cloud, and whether its place is starved; the sample relative to `corner`."""
+    row, level, coarsest = cloud.row, cloud.level, F(0.0)
+    while True:
+        axis, half, place = halvings[level].axis, halvings[level].half, places[row]
+        along = x if axis == 0 else (y if axis == 1 else z)
+        above = along >= half
+        if above:
+            row, spacing, beyond, other = place.upper, place.upper_spacing, place.lower, abs(place.lower_spacing)
+            edge = half * F(1.0 - 1e-6)
+        else:
+            row, spacing, beyond, other = place.lower, place.lower_spacing, place.upper, abs(place.upper_spacing)
+            edge = F(0.0)
+        apart = abs(along - half)
+        if other > max(coarsest, abs(spacing) if row < 0 else F(0.0)) and apart < reach * other:
+            if beyond >= 0:
+                # What the sample faces straight across the plane.
+                other = _facing(
+                    beyond,
+                    level + 1,
+                    edge if axis == 0 else x,
+                    edge if axis == 1 else y,
+                    edge if axis == 2 else z,
+                    places,
+                    halvings,
+                )
+            if apart < reach * other:
+                coarsest = max(coarsest, other)
+        if row < 0:
+            return max(abs(spacing), coarsest), spacing < F(0.0)
+        if above:
+            if axis == 0:
+                x -= half
+            elif axis == 1:
+                y -= half
+            else:
+                z -= half
+        level += 1
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def splat(
     keys: NDArray[np.uint64],
     vertex: NDArray[np.uint16],
     clouds: NDArray[Any],
+    places: NDArray[Any],
+    halvings: NDArray[Any],
     rotation: NDArray[np.float32],
     view: Any,
 ) -> None:  # pragma: no cover - compiled
@@ -205,6 +300,8 @@ def splat(
     vertex : (n, 4) uint16
         x, y, z, normal.
     clouds : (k,) CLOUD
+    places : (n,) PLACE
+    halvings : (levels,) HALVING
     rotation : (3, 3) float32
         Model space to camera space.
     view : VIEW
@@ -217,7 +314,7 @@ def splat(
     r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
     for c in range(len(clouds)):
         cloud = clouds[c]
-        ox, oy, oz, scale, side_at_1 = cloud.x, cloud.y, cloud.z, cloud.scale, cloud.side
+        ox, oy, oz, scale, side_at_1 = cloud.x, cloud.y, cloud.z, cloud.scale, cloud.spacing * view.closing
         start, place = cloud.first, cloud.place
         for i in range(start, start + cloud.count):
             x = ox + scale * F(vertex[i, 0])
@@ -237,6 +334,12 @@ def splat(
             up = r10 * x + r11 * y + r12 * z
             px = middle_x + focal * right * inverse
             py = middle_y - focal * up * inverse
+            if cloud.level >= 0:
+                inside_x = cloud.corner_x + scale * F(vertex[i, 0])
+                inside_y = cloud.corner_y + scale * F(vertex[i, 1])
+                inside_z = cloud.corner_z + scale * F(vertex[i, 2])
+                spacing, _ = _spacing_at(cloud, inside_x, inside_y, inside_z, view.reach, places, halvings)
+                side_at_1 = spacing * view.closing
             side = min(side_at_1 * inverse, largest)
             half = side * (round_half if side > round_from else F(0.5))
             if not (px + half >= F(0.0) and py + half >= F(0.0) and px - half < width and py - half < height):
@@ -273,17 +376,20 @@ def resolve(
     depth: NDArray[np.float32],
     node: NDArray[np.int32],
     side: NDArray[np.float32],
+    starved: NDArray[np.bool_],
     vertex: NDArray[np.uint16],
     color: NDArray[np.uint8],
     clouds: NDArray[Any],
     cloud_of_block: NDArray[np.int32],
+    places: NDArray[Any],
+    halvings: NDArray[Any],
     rotation: NDArray[np.float32],
     view: Any,
     light: Any,
     albedo: NDArray[np.float32],
     background: NDArray[np.uint8],
 ) -> None:  # pragma: no cover - compiled
-    """Colour, depth, node and side of the splat of the rows `top` to `bottom` from the key images (threads, h, w)."""
+    """Colour, depth, node, side and starvation of the rows `top` to `bottom` from the key images (threads, h, w)."""
     threads, _, width = layers.shape
     middle_x, middle_y, focal = view.width * F(0.5), view.height * F(0.5), view.focal
     for row in range(top, bottom):
@@ -295,6 +401,7 @@ def resolve(
                     key = other
             if key == EMPTY:
                 depth[row, column], node[row, column], side[row, column] = np.inf, -1, 0.0
+                starved[row, column] = False
                 for channel in range(3):
                     rgb[row, column, channel] = background[channel]
                 continue
@@ -306,7 +413,14 @@ def resolve(
             y = cloud.y + cloud.scale * F(vertex[i, 1])
             z = cloud.z + cloud.scale * F(vertex[i, 2])
             here = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
-            across = min(cloud.side / here, view.largest)
+            spacing, hungry = cloud.spacing, cloud.starved
+            if cloud.level >= 0:
+                inside_x = cloud.corner_x + cloud.scale * F(vertex[i, 0])
+                inside_y = cloud.corner_y + cloud.scale * F(vertex[i, 1])
+                inside_z = cloud.corner_z + cloud.scale * F(vertex[i, 2])
+                spacing, hungry = _spacing_at(cloud, inside_x, inside_y, inside_z, view.reach, places, halvings)
+            starved[row, column] = hungry
+            across = min(spacing * view.closing / here, view.largest)
             if across > view.round_from and view.oriented and code != 0:
                 right = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
                 up = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z

@@ -40,6 +40,13 @@ LONGEST = 3600.0
     help="Spacing of samples on the screen that is fine enough, pixels.",
 )
 @click.option("--priority", default="index", show_default=True, type=click.Choice(["index", "error"]))
+@click.option(
+    "--splat-rule",
+    default="place",
+    show_default=True,
+    type=click.Choice(["place", "paper"]),
+    help="A splat's size follows the data at its place, or, as in the paper, its cloud.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print report.json on stdout.")
 def stream(
     model: str,
@@ -52,6 +59,7 @@ def stream(
     size: tuple[int, int],
     tolerance: float,
     priority: str,
+    splat_rule: str,
     as_json: bool,
 ) -> None:
     """Stream MODEL over a link and report its error against run time."""
@@ -82,6 +90,7 @@ def stream(
         size=size,
         tolerance=tolerance,
         priority="error" if priority == "error" else "index",
+        splat_rule="paper" if splat_rule == "paper" else "place",
         views=views,
     )
     prepare_folder(report)

@@ -14,7 +14,7 @@ import numpy as np
 from pointstream.layer import AccessLayer, LayerOptions
 from pointstream.stores import open_store
 from pointview.camera import Camera
-from pointview.refine import Priority, refine
+from pointview.refine import Priority, SplatRule, refine
 from pointview.render import Frame, Style, open_backend
 from pointview.settle import settle
 from pointview.still import CAPACITY
@@ -58,6 +58,7 @@ class Experiment:
     tolerance : float
         Pixels.
     priority : {"index", "error"}
+    splat_rule : {"place", "paper"}
     views : ViewPath, optional
         Where the camera is; the whole model without.
     """
@@ -70,6 +71,7 @@ class Experiment:
     size: tuple[int, int]
     tolerance: float
     priority: Priority
+    splat_rule: SplatRule = "place"
     views: ViewPath | None = None
 
     def camera_at(self, header: Header, t: float) -> Camera:
@@ -86,6 +88,7 @@ class Experiment:
             seconds=self.seconds,
             tolerance=self.tolerance,
             priority=self.priority,
+            splat_rule=self.splat_rule,
             threads=min(os.cpu_count() or 1, MOST_THREADS),
         )
 
@@ -181,6 +184,7 @@ def _report(experiment: Experiment, recording: Recording, curve: Sequence[dict[s
         link=experiment.link,
         clock=experiment.clock,
         priority=experiment.priority,
+        splat_rule=experiment.splat_rule,
         size=experiment.size,
         seconds=experiment.seconds,
         samples=recording.samples,

@@ -33,6 +33,7 @@ class Report:
     link: str
     clock: str
     priority: str
+    splat_rule: str
     size: tuple[int, int]
     seconds: float
     samples: int

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import zstandard
 
-from pointview.refine import Cut, Priority, refine
+from pointview.refine import Cut, Priority, SplatRule, refine
 from pointview.render import Kind, Style, open_backend
 
 if TYPE_CHECKING:
@@ -43,6 +43,8 @@ class SessionOptions:
         Pixels.
     priority : {"index", "error"}
         Order of the wants.
+    splat_rule : {"place", "paper"}
+        What the size of a splat follows.
     frame_interval : float
         Seconds between two frames.
     backend : {"auto", "gl", "cpu"}
@@ -54,6 +56,7 @@ class SessionOptions:
     seconds: float
     tolerance: float = 1.0
     priority: Priority = "index"
+    splat_rule: SplatRule = "place"
     frame_interval: float = 1.0 / 30.0
     backend: Kind = "auto"
     threads: int = 1
@@ -256,6 +259,7 @@ class _Session:
             self.options.tolerance,
             layer.resident,
             priority=self.options.priority,
+            splat_rule=self.options.splat_rule,
             cull_backfaces=not self.options.style.two_sided,
         )
         layer.end_frame(cut.wants, pinned=cut.nodes)

@@ -19,8 +19,8 @@ CONTRACT = [
     "curve",
 ]  # fmt: skip
 EXTRA = [
-    "model", "priority", "size", "seconds", "model_samples", "model_bytes", "payload_bytes", "wanted_s", "frames",
-    "errors",
+    "model", "priority", "splat_rule", "size", "seconds", "model_samples", "model_bytes", "payload_bytes", "wanted_s",
+    "frames", "errors",
 ]  # fmt: skip
 ENTRY = [
     "t", "bytes", "requests", "resident_clouds", "splats", "starved_fraction", "max_spacing_px", "psnr_db", "ssim",

@@ -1,7 +1,7 @@
 // Holes of the sampling take the look of the wall around them: the same rule as kernels.close_holes.
 
 uniform sampler2D picture;
-uniform sampler2D depths;   // depth, side
+uniform sampler2D depths;   // depth, side (negative: starved)
 uniform isampler2D nodes;
 uniform float focal;
 
@@ -29,7 +29,8 @@ void main() {
             if (any(lessThan(there, ivec2(0))) || any(greaterThan(there, last)))
                 break;
             vec2 wall = texelFetch(depths, there, 0).rg;
-            if (wall.r < z && float(step) <= max(REACH * wall.g, 1.0) && wall.r * (1.0 + wall.g / focal) < z) {
+            float wide = abs(wall.g);
+            if (wall.r < z && float(step) <= max(REACH * wide, 1.0) && wall.r * (1.0 + wide / focal) < z) {
                 ++found;
                 if (step < nearest) {
                     nearest = step;

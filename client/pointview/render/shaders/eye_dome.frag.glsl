@@ -1,7 +1,7 @@
 // Eye-dome lighting: see shading.py for the formula.
 
 uniform sampler2D picture;
-uniform sampler2D depths;   // depth, side
+uniform sampler2D depths;   // depth, side (negative: starved)
 uniform float strength;     // times the focal length
 
 layout(location = 0) out vec4 out_color;
@@ -18,7 +18,7 @@ void main() {
         out_color = color;
         return;
     }
-    int away = max(int(seen.g * NEIGHBOUR + 0.5), 1);
+    int away = max(int(abs(seen.g) * NEIGHBOUR + 0.5), 1);
     float product = 1.0;
     for (int y = -1; y <= 1; ++y)
         for (int x = -1; x <= 1; ++x) {

@@ -15,7 +15,7 @@ uniform vec2 range;
 uniform float bulge;
 
 layout(location = 0) out vec4 out_color;
-layout(location = 1) out vec2 out_depth;   // depth; side of the splat, pixels
+layout(location = 1) out vec2 out_depth;   // depth; side of the splat, pixels, negative where starved
 layout(location = 2) out int out_node;
 
 void main() {

@@ -9,11 +9,15 @@ in vec4 color;       // 0 to 1
 #ifdef COMMANDS
 in vec3 offset;      // of the cloud's (0, 0, 0) from the eye, axes of model space
 in vec2 placement;   // model units of a step; side of a splat, pixels times depth
+in vec3 corner;      // of the node's cell to the cloud's (0, 0, 0), axes of model space
 in int node;
+in ivec2 place;      // row of the node among the places, + STARVED; its level, or -1: one spacing everywhere
 #else
 uniform vec3 offset;
 uniform vec2 placement;
+uniform vec3 corner;
 uniform int node;
+uniform ivec2 place;
 #endif
 
 uniform mat3 rotation;     // model space to camera space: right, up, depth
@@ -25,6 +29,10 @@ uniform float largest;
 uniform float round_from;
 uniform float round_factor;
 uniform float steepest;
+uniform float reach;
+uniform float closing;     // side of a splat over the spacing to close, times the focal length
+uniform sampler2D places;  // of each level (axis, half); then of each node (links, spacings): see places.py
+uniform int levels;
 uniform bool oriented;
 uniform vec3 albedo;
 uniform vec3 lamp;         // camera space
@@ -45,6 +53,55 @@ const float DIFFUSE = @DIFFUSE@;
 const float SPECULAR = @SPECULAR@;
 const float SHININESS = @SHININESS@;
 const float UNLIT = @UNLIT@;
+
+const int STARVED = 1 << 30;
+
+vec4 texel(int i) {
+    return texelFetch(places, ivec2(i & 1023, i >> 10), 0);
+}
+
+// The same rule as kernels._facing.
+float facing(int row, int level, vec3 p) {
+    float spacing = 0.0;
+    while (row >= 0) {
+        vec2 halving = texel(level).xy;
+        vec3 axis = vec3(equal(vec3(halving.x), vec3(0.0, 1.0, 2.0)));
+        vec4 node = texel(levels + row);
+        bool above = dot(p, axis) >= halving.y;
+        p -= above ? axis * halving.y : vec3(0.0);
+        row = int(above ? node.y : node.x);
+        spacing = above ? node.w : node.z;
+        ++level;
+    }
+    return abs(spacing);
+}
+
+// The same rule as kernels._spacing_at: the spacing to close at p, negative where starved.
+float spacing_at(int row, int level, vec3 p) {
+    float coarsest = 0.0;
+    float spacing = 0.0;
+    while (row >= 0) {
+        vec2 halving = texel(level).xy;
+        vec3 axis = vec3(equal(vec3(halving.x), vec3(0.0, 1.0, 2.0)));
+        vec4 node = texel(levels + row);
+        bool above = dot(p, axis) >= halving.y;
+        int beyond = int(above ? node.x : node.y);
+        float other = abs(above ? node.z : node.w);
+        float apart = abs(dot(p, axis) - halving.y);
+        row = int(above ? node.y : node.x);
+        spacing = above ? node.w : node.z;
+        ++level;
+        if (other > max(coarsest, row < 0 ? abs(spacing) : 0.0) && apart < reach * other) {
+            float edge = above ? halving.y * (1.0 - 1e-6) : 0.0;
+            if (beyond >= 0)
+                other = facing(beyond, level, p * (1.0 - axis) + edge * axis);
+            if (apart < reach * other)
+                coarsest = max(coarsest, other);
+        }
+        p -= above ? axis * halving.y : vec3(0.0);
+    }
+    return spacing < 0.0 ? -max(-spacing, coarsest) : max(spacing, coarsest);
+}
 
 vec3 octahedral(float code) {
     float high = floor(code / 256.0);
@@ -102,7 +159,14 @@ void main() {
     rgb = min(color.rgb * albedo * shade.x + shade.y, 1.0);
     seen = node;
     middle = 0.5 * size + center.xy * (focal / depth);
-    side = min(placement.y / depth, largest);
+    float across = placement.y;
+    bool starved = place.x >= STARVED;
+    if (place.y >= 0) {
+        float spacing = spacing_at(place.x & (STARVED - 1), place.y, corner + placement.x * vertex.xyz);
+        across = abs(spacing) * closing;
+        starved = spacing < 0.0;
+    }
+    side = min(across / depth, largest);
     extent = 0.5 * side * (side > round_from ? round_factor : 1.0);
     gl_PointSize = ceil(2.0 * extent) + 1.0;
     plane = vec3(0.0);
@@ -124,4 +188,6 @@ void main() {
         kind = BALL;
     }
     gl_Position = vec4(2.0 * (middle + margin) / (size + 2.0 * margin) - 1.0, 0.0, 1.0);
+    if (starved)
+        side = -max(side, 1e-6);
 }

@@ -1,0 +1,123 @@
+"""How coarse a cut is at each place: the spacing that the splat of a sample must close.
+
+LPC 4 gives one size to all splats of a cloud. But a cloud's samples lie in all of its descendants' cells: where some of
+these are here and others not yet, one size is either too small for the one half or too large for the other. So a
+sample's splat follows the deepest drawn node at the sample's place.
+
+The cells of the tree are those of the build (docs/format.md, Cells): the box of all samples, halved again and again at
+the middle of its longest side, so a sample's place is found by comparing one coordinate a level. A fat splat must not
+end where its cell does, or a seam of half covered ground would show: a sample of the drawn ancestors as near to a
+coarser cell as `splats.REACH` of that cell's spacings takes the size of that cell too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from lpc.header import Header
+
+MOST_HALVINGS = 48
+"""Of one axis; a build tells no samples apart beyond."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Places:
+    """The drawn part of the tree, for looking up the cell of a sample.
+
+    Parameters
+    ----------
+    link : (n, 2) int32
+        Row of the drawn node in the lower and upper half of the cell of each drawn node, -1 where that half ends here.
+    spacing : (n, 2) float32
+        Spacing to close in each half, model units; the largest of it where a link goes deeper. Negative in a half
+        that ends here because its node is missing.
+    corner : (n, 3) float64
+        Lowest corner of the node's cell, model space.
+    level : (n,) int32
+        Of the node; -1 where both halves end here with one spacing, so that nothing need be looked up.
+    axis : (levels,) int32
+        Axis along which the cells of a level are halved.
+    half : (levels,) float32
+        Half the side of such a cell along that axis, model units.
+    """
+
+    link: NDArray[np.int32]
+    spacing: NDArray[np.float32]
+    corner: NDArray[np.float64]
+    level: NDArray[np.int32]
+    axis: NDArray[np.int32]
+    half: NDArray[np.float32]
+
+
+def halvings(header: Header, levels: int) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Axis and half side, model units, by which the cells of each of so many levels are halved.
+
+    Notes
+    -----
+    Below the level where nothing tells samples apart, cells have no extent: axis 0, half 0.
+    """
+    bounds = [float(value) for value in header.bounds]
+    sides = [high - low for low, high in zip(bounds[:3], bounds[3:], strict=True)]
+    used, axes, halves = [0, 0, 0], np.zeros(levels, dtype=np.int32), np.zeros(levels)
+    for level in range(levels):
+        left = [side if count < MOST_HALVINGS else 0.0 for side, count in zip(sides, used, strict=True)]
+        axis = left.index(max(left))
+        if left[axis] == 0.0:
+            break
+        sides[axis] /= 2
+        used[axis] += 1
+        axes[level], halves[level] = axis, sides[axis]
+    return axes, halves
+
+
+def places(
+    header: Header,
+    drawn: Sequence[NDArray[np.bool_]],
+    missing: Sequence[NDArray[np.bool_]],
+    own: Sequence[NDArray[np.float64]],
+    shown: Sequence[NDArray[np.float64]],
+) -> Places:
+    """Lay out the drawn nodes, level by level.
+
+    Parameters
+    ----------
+    drawn, missing : sequence of (n, 2) bool
+        For each node of a level, which children are drawn and which are missing.
+    own, shown : sequence of (n,) float64
+        Each node's own spacing and the largest shown around its samples.
+    """
+    axes, halves = halvings(header, len(drawn))
+    corner = np.array([header.bounds[:3]], dtype=np.float64)
+    links, spacings, corners, levels, row = [], [], [], [], 0
+    for depth, (goes_on, ends) in enumerate(zip(drawn, missing, strict=True)):
+        row += len(goes_on)
+        children = int(np.count_nonzero(goes_on))
+        link = np.full(goes_on.shape, -1, dtype=np.int32)
+        link[goes_on] = np.arange(row, row + children)
+        spacing = np.where(ends, -own[depth][:, None], shown[depth][:, None])
+        if children:
+            spacing[goes_on] = shown[depth + 1]
+        uniform = (link < 0).all(axis=1) & (spacing[:, 0] == spacing[:, 1])
+        links.append(link)
+        spacings.append(spacing)
+        corners.append(corner)
+        levels.append(np.where(uniform, -1, depth))
+        below = np.repeat(corner, 2, axis=0).reshape(-1, 2, 3)
+        below[:, 1, axes[depth]] += halves[depth]
+        corner = below[goes_on]
+    return Places(
+        link=np.concatenate(links),
+        spacing=np.concatenate(spacings).astype(np.float32),
+        corner=np.concatenate(corners),
+        level=np.concatenate(levels).astype(np.int32),
+        axis=axes,
+        half=halves.astype(np.float32),
+    )

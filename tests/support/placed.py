@@ -1,0 +1,87 @@
+"""The spacing that a sample must close, by walking the tree of the cut in float64: slow and obvious."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pointview import splats
+
+
+def cell_of(header, path):
+    """Box (2, 3) of the cell that a path of halves leads to, and the axis along which it is halved next."""
+    low, high = np.array(header.bounds, dtype=float).reshape(2, 3)
+    for half in path:
+        axis = int(np.argmax(high - low))
+        middle = (low[axis] + high[axis]) / 2
+        (low if half else high)[axis] = middle
+    return np.array([low, high]), int(np.argmax(high - low))
+
+
+def path_of(index, node):
+    """Halves from the root to a node."""
+    path = []
+    while index.parent[node] >= 0:
+        parent = index.parent[node]
+        path.insert(0, int(index.children[parent][1] == node))
+        node = parent
+    return path
+
+
+class Walk:
+    """Looks spacings up in one cut."""
+
+    def __init__(self, model, cut):
+        self.index, self.header = model.index, model.header
+        self.spacing = dict(zip(cut.nodes.tolist(), cut.spacing.tolist(), strict=True))
+        self.wants = set(cut.wants.tolist())
+
+    def end(self, node, half):
+        """What half a cell without a drawn node shows: spacing, starved."""
+        child = int(self.index.children[node][half])
+        if child in self.wants:
+            return float(self.index.spacing[node]), True
+        return self.spacing[node], False
+
+    def coarsest(self, node, half):
+        child = int(self.index.children[node][half])
+        return self.spacing[child] if child in self.spacing else self.end(node, half)[0]
+
+    def deepest(self, node, xyz):
+        """Spacing and starvation of the cell below a drawn node that holds a position."""
+        box, axis = cell_of(self.header, path_of(self.index, node))
+        half = int(xyz[axis] >= box[:, axis].mean())
+        child = int(self.index.children[node][half])
+        return self.deepest(child, xyz) if child in self.spacing else self.end(node, half)
+
+    def at(self, node, xyz):
+        """Spacing to close at a sample of a drawn node, and whether its place is starved."""
+        own, starved = self.deepest(node, xyz)
+        if (own, starved) == self.deepest_everywhere(node):
+            return own, starved
+        spacing, here = own, node
+        while here in self.spacing:
+            box, axis = cell_of(self.header, path_of(self.index, here))
+            middle = box[:, axis].mean()
+            half = int(xyz[axis] >= middle)
+            apart = abs(xyz[axis] - middle)
+            across = np.array(xyz, dtype=float)
+            across[axis] = middle - 1e-9 * (box[1] - box[0])[axis] if half else middle
+            beyond = int(self.index.children[here][1 - half])
+            if beyond in self.spacing:
+                if apart < splats.REACH * self.spacing[beyond]:
+                    facing, _ = self.deepest(beyond, across)
+                else:
+                    facing = 0.0
+            else:
+                facing, _ = self.end(here, 1 - half)
+            if apart < splats.REACH * facing:
+                spacing = max(spacing, facing)
+            here = int(self.index.children[here][half])
+        return spacing, starved
+
+    def deepest_everywhere(self, node):
+        """The same for all samples of a node that no drawn node refines, if both halves agree."""
+        if any(int(child) in self.spacing for child in self.index.children[node]):
+            return None
+        ends = {self.end(node, half) for half in (0, 1)}
+        return ends.pop() if len(ends) == 1 else None
