@@ -6,12 +6,13 @@ and the attribute codes. Rows are whole 8-byte words, which is how kernels copy 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
+    from contextlib import AbstractContextManager
 
     from numpy.typing import NDArray
 
@@ -19,6 +20,39 @@ if TYPE_CHECKING:
 
 XYZ_WORDS = 3
 PRIORITY_WORD = 3
+
+
+class Rows(Protocol):
+    """All rows of a build, bucket by bucket: what the stages after the scatter need of them.
+
+    Parameters
+    ----------
+    dtype : dtype
+        Of a row.
+    first : ndarray, (buckets + 1,) int64
+        Bucket b is the rows ``first[b]`` to ``first[b + 1]``.
+    """
+
+    dtype: np.dtype[Any]
+    first: NDArray[np.int64]
+
+    def read(self, row: int, out: NDArray[Any]) -> None:
+        """Fill `out` with rows from number `row` on."""
+
+    def chunks(self, row: int, count: int, most: int) -> Iterator[NDArray[Any]]:
+        """Yield `count` rows from number `row` on, at most `most` at a time."""
+
+    def rewriting(self, row: int) -> AbstractContextManager[int]:
+        """Give a file for rows that are to stand from number `row` on, all of one bucket."""
+
+    def settle(self, row: int) -> None:
+        """Rows that were replaced will not be asked for again as they were."""
+
+    def replaced(self) -> Rows:
+        """Give the rows after every bucket was replaced."""
+
+    def remove(self) -> None:
+        """Remove the files."""
 
 
 def row_dtype(schema: Schema) -> np.dtype[Any]:

@@ -8,11 +8,16 @@ from __future__ import annotations
 
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from typing import TYPE_CHECKING, Self, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
     from types import TracebackType
+
+    from .folder import Folder
+    from .rows import Rows
+    from .scatter import Regions
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -44,19 +49,34 @@ class Crew:
         One item more than there are threads is under way or waiting to be yielded, which is what bounds the memory.
         When the caller stops or a call fails, what has not begun is cancelled and what has is waited for.
         """
-        flying: deque[tuple[Item, Future[Result]]] = deque()
-        try:
-            for item in items:
-                if len(flying) > self.threads:
-                    first, future = flying.popleft()
-                    yield first, future.result()
-                flying.append((item, self._pool.submit(function, item)))
-            while flying:
+        return in_order(partial(self._pool.submit, function), items, self.threads)
+
+    def share(self, regions: Regions, folder: Folder) -> Rows:  # noqa: ARG002, others need the folder
+        """Take the scattered rows where all that `spread` runs can reach them: they are there already."""
+        return regions
+
+    def spread(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[tuple[Item, Result]]:
+        """Do as `map` does, on other machines if there are any; the function and the items can be pickled."""
+        return self.map(function, items)
+
+
+def in_order(
+    submit: Callable[[Item], Future[Result]], items: Iterable[Item], ahead: int
+) -> Iterator[tuple[Item, Result]]:
+    """Yield every item with its result, in the order of the items, while up to `ahead` more are submitted."""
+    flying: deque[tuple[Item, Future[Result]]] = deque()
+    try:
+        for item in items:
+            if len(flying) > ahead:
                 first, future = flying.popleft()
                 yield first, future.result()
-        finally:
-            for _, future in flying:
-                future.cancel()
-            for _, future in flying:
-                if not future.cancelled():
-                    future.exception()
+            flying.append((item, submit(item)))
+        while flying:
+            first, future = flying.popleft()
+            yield first, future.result()
+    finally:
+        for _, future in flying:
+            future.cancel()
+        for _, future in flying:
+            if not future.cancelled():
+                future.exception()
