@@ -2,7 +2,7 @@
 
 Usage: PYTHONPATH=common:server:client:tests python benchmarks/access.py [MODEL.lpc]
 
-Without a model, one of 400,000 samples is made up. The lines are pointlink's: the real httpx, a virtual clock; every
+Without a model, one of 600,000 samples is made up. The lines are pointlink's: the real httpx, a virtual clock; every
 run is the same. The frame loop stands for a viewer that wants everything, coarse first, at 30 frames a second.
 """
 
@@ -28,6 +28,7 @@ from pointlink.resources import Resource
 from pointstream.layer import AccessLayer, LayerOptions
 from pointstream.scheduler import LinkState, Scheduler
 from pointstream.stores import MemoryStore
+from pointstream.stores.dialling import OneConnection
 from pointstream.stores.http import HttpStore
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from pointlink.profiles import Profile
 
 FRAME = 1 / 30
+SAMPLES = 600_000
 
 
 @asynccontextmanager
@@ -46,7 +48,7 @@ async def opened(data: bytes, profile: Profile) -> AsyncIterator[AccessLayer]:
     store = HttpStore(
         "http://host/model.lpc",
         clock=asyncio.get_running_loop().time,
-        transports=lambda: network.transport(max_connections=1),
+        transports=lambda: OneConnection(backend=network, keep_alive=None),
     )
     layer = await AccessLayer.open(store)
     try:
@@ -101,7 +103,7 @@ async def jumping(data: bytes, profile: Profile) -> float:
     store = HttpStore(
         "http://host/model.lpc",
         clock=asyncio.get_running_loop().time,
-        transports=lambda: network.transport(max_connections=1),
+        transports=lambda: OneConnection(backend=network, keep_alive=None),
     )
     layer = await AccessLayer.open(store, options=LayerOptions(capacity=400_000))
     for number in range(1800):
@@ -147,12 +149,14 @@ async def local(data: bytes) -> tuple[float, int]:
 
 
 def made_up() -> bytes:
-    """A bumpy sphere of 400,000 samples."""
+    """A bumpy sphere."""
     draw = np.random.default_rng(0)
-    xyz = draw.normal(size=(400_000, 3))
+    xyz = draw.normal(size=(SAMPLES, 3))
     xyz /= np.linalg.norm(xyz, axis=1)[:, None]
     normal = xyz.astype(np.float32)
-    return build_bytes(PointBatch(xyz * (1 + 0.05 * np.sin(20 * xyz[:, :1])), {"normal": normal}), cloud_size=2048)
+    return build_bytes(
+        PointBatch(xyz * (1 + 0.05 * np.sin(20 * xyz[:, :1])), {"normal": normal}), cloud_size=2048, page_nodes=256
+    )
 
 
 def main() -> None:

@@ -92,13 +92,14 @@ class Cache:
         os.utime(entry)
         return SparseFile(entry / MODEL, length=header.bytes, tag=header.tag)
 
-    def room(self, keep: Path) -> int:
-        """Clear away what was used least recently until the limit is kept; the bytes that are free then.
+    def room(self, keep: Path, size: int) -> int:
+        """Clear away what was used least recently until there is room for `size` bytes; return the bytes free then.
 
         Parameters
         ----------
         keep : Path
             The file in use: never cleared.
+        size : int
         """
         sizes, ages = {}, {}
         with contextlib.suppress(OSError):
@@ -108,7 +109,7 @@ class Cache:
                         sizes[entry], ages[entry] = _bytes_on_disk(entry), entry.stat().st_mtime
         total = sum(sizes.values())
         for entry in sorted(sizes, key=ages.__getitem__):
-            if total <= self.limit:
+            if total + size <= self.limit:
                 break
             if entry != keep.parent and self.clear(entry):
                 total -= sizes[entry]

@@ -23,7 +23,7 @@ those allowed by the estimated network bandwidth, and forgetting the rest". A li
    overdraw it. The window keeps the queue short, the bucket keeps a window that was guessed too large from being
    spent twice. `gain` above 1 lets the estimate grow when the link does.
 6. *Slow start.* Before the first measurement there is no bucket, and the window grows by every byte that lands: it
-   doubles each round trip from one that suits the prior.
+   doubles each round trip from one that suits the prior. Requests grow with it, since only so many fly at a time.
 7. *A local file has no link*: a constant window bounds what is in flight, and the layer stops asking while too much
    waits to be decoded.
 
@@ -69,7 +69,7 @@ class SchedulerOptions:
         Wants that are looked at; the rest comes with a later frame.
     """
 
-    request_seconds: float = 0.125
+    request_seconds: float = 0.1
     smallest_request: int = 8192
     largest_request: int = 1 << 19
     overhead: int = 400
@@ -231,14 +231,18 @@ class Scheduler:
         if link is None:
             return self.options.local_window // 4
         length = int(link.rate * self.options.request_seconds)
+        if not link.measured:
+            length += self._grown // self.options.most_requests
         return min(max(length, self.options.smallest_request), self.options.largest_request)
 
     def window(self, link: LinkState | None) -> int:
         """Bytes outstanding, at most."""
         if link is None:
             return self.options.local_window
-        window = int(link.rate * (link.rtt + self.options.look_seconds)) + self.longest(link)
-        return window if link.measured else min(window + self._grown, self.options.most_window)
+        flight = int(link.rate * (link.rtt + self.options.look_seconds))
+        if link.measured:
+            return flight + self.longest(link)
+        return min(flight + self._grown, self.options.most_window) + self.longest(link)
 
     def _widest_gap(self, link: LinkState | None, outstanding: int) -> int:
         if link is None:

@@ -52,8 +52,8 @@ def test_requests_are_short_but_hold_one_object() -> None:
     scheduler = Scheduler()
     offer(scheduler, [(k, k * 4000, k * 4000 + 4000) for k in range(100)])
     (request,) = scheduler.issue(0.0, ADSL)[:1]
-    assert request.range.size <= 0.125 * ADSL.rate
-    assert len(request.items) == 4
+    assert request.range.size <= SchedulerOptions().request_seconds * ADSL.rate
+    assert len(request.items) == 3
     scheduler = Scheduler()
     offer(scheduler, [(0, 0, 5_000_000)])
     assert spans(scheduler.issue(0.0, ADSL)) == [(0, 5_000_000, (0,))]

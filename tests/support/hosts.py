@@ -16,6 +16,7 @@ from pointlink.resources import Resource
 from pointstream.cache import Cache
 from pointstream.stores import LocalStore, MemoryStore
 from pointstream.stores.cached import CachedStore
+from pointstream.stores.dialling import OneConnection
 from pointstream.stores.http import HttpOptions, HttpStore
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ async def virtual_store(
         ADDRESS,
         clock=asyncio.get_running_loop().time,
         options=options,
-        transports=lambda: network.transport(max_connections=1),
+        transports=lambda: OneConnection(backend=network, keep_alive=None),
     )
     before = asyncio.all_tasks()
     try:

@@ -54,7 +54,7 @@ class Shelf(Protocol):
     def open(self, address: str, header: Header) -> SparseFile:
         """Open it, made if need be."""
 
-    def room(self, keep: Path) -> int:
+    def room(self, keep: Path, size: int) -> int:
         """Bytes that may be added to a file."""
 
     def clear(self, entry: Path) -> bool:
@@ -268,7 +268,7 @@ class CachedStore:
 
     def _keep(self, file: SparseFile, place: ByteRange, data: bytes) -> None:
         if self._room < place.size:
-            self._room = min(self.cache.room(file.path), LOOKED)
+            self._room = min(self.cache.room(file.path, place.size), LOOKED)
         if self._room >= place.size:
             file.keep(place, data)
             self._room -= place.size

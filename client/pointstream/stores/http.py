@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING, cast
 
 import httpx
 
-from lpc.errors import StoreError
+from lpc.errors import StoreError, Unavailable
 from lpc.ranges import ByteRange
 from pointstream.goodput import Goodput, Transfer
 
 from .base import KeepsNothing
+from .breaker import Breaker, BreakerOptions
 from .lanes import Lane, Lanes, plain_transports
 from .patience import PatienceOptions, Tries, overdue
 from .replies import Beyond, Moved, Part, Pins, Retry, Whole, judge, ranges_unsupported
@@ -31,6 +32,9 @@ if TYPE_CHECKING:
 
     from .base import Sink
 
+DIALLED = 4
+"""Connections opened together with the first, so that what the first bytes make wanted need not wait for them."""
+PORTS = {"http": 80, "https": 443}
 MOST_HOPS = 5
 DRAINED = 65_536
 """Surplus bytes after the wanted ones that are read to keep a connection; more, and a new one is cheaper."""
@@ -49,12 +53,15 @@ class HttpOptions:
     headers : tuple of (str, str)
         Sent with every request, for example ``("Authorization", "Bearer ...")``.
     patience : PatienceOptions
-        Waiting and retrying.
+        Waiting and retrying, of each range.
+    breaker : BreakerOptions
+        Leaving the host alone, of all ranges together.
     """
 
     lanes: int = 8
     headers: tuple[tuple[str, str], ...] = ()
     patience: PatienceOptions = field(default_factory=PatienceOptions)
+    breaker: BreakerOptions = field(default_factory=BreakerOptions)
 
 
 class HttpStore(KeepsNothing):
@@ -70,6 +77,8 @@ class HttpStore(KeepsNothing):
         Makes a transport of one connection at each call: what stands in for the network in tests and simulations.
     meter : Goodput, optional
         Of the link, if others share it.
+    breaker : Breaker, optional
+        Of the host, if others share it.
     rng : random.Random, optional
         Of the jitter between tries.
 
@@ -87,6 +96,7 @@ class HttpStore(KeepsNothing):
         options: HttpOptions | None = None,
         transports: Callable[[], httpx.AsyncBaseTransport] | None = None,
         meter: Goodput | None = None,
+        breaker: Breaker | None = None,
         rng: random.Random | None = None,
     ) -> None:
         self.options = options or HttpOptions()
@@ -96,6 +106,7 @@ class HttpStore(KeepsNothing):
         self.length: int | None = None
         self.meter: Goodput | None = meter or Goodput()
         self._link = self.meter
+        self._breaker = breaker or Breaker(self.host, self.options.breaker)
         self._clock = clock
         self._rng = rng or random.Random(0)
         self._headers = [*headers, *self.options.headers]
@@ -130,13 +141,19 @@ class HttpStore(KeepsNothing):
                 body.feed(wanted.start, self._whole[wanted.start : wanted.stop])
                 break
             before = body.offset
+            while (wait := self._breaker.check(self._clock())) > 0.0:
+                await asyncio.sleep(wait)  # noqa: ASYNC110 - on the clock of the breaker
             try:
                 moved = await self._attempt(body)
             except Retry as retry:
                 if self._pins.etag is None:
                     body.restart()  # the rest could be another build's
-                await asyncio.sleep(tries.wait(retry))
+                await asyncio.sleep(self._wait(tries, retry))
                 continue
+            except BaseException:
+                self._breaker.abandoned(self._clock())
+                raise
+            self._breaker.answered()
             hops, pieces = hops + moved, pieces + 1
             if hops > MOST_HOPS or pieces > self.options.patience.pieces + hops:
                 raise StoreError(f"{self.name}: the host sends us round in circles")
@@ -158,10 +175,23 @@ class HttpStore(KeepsNothing):
         """Close all connections."""
         await self._lanes.close()
 
+    def _wait(self, tries: Tries, retry: Retry) -> float:
+        """Seconds to wait before a range is asked for again; Unavailable if it is not to be."""
+        if not retry.stale:
+            self._breaker.failed(self._clock(), str(retry))
+        wait = tries.wait(retry)
+        if not retry.stale and not self._breaker.may_retry():
+            raise Unavailable(f"{self.name}: too many requests fail ({retry})") from retry
+        return wait
+
     async def _attempt(self, body: _Body) -> bool:
         """Make one request for what is missing of a body; True if it was answered with a redirect."""
         wanted = ByteRange(body.offset, body.stop)
         watch = _Watch(self._link, self._link.begin(self._clock(), wanted.size), self._clock, self.options.patience)
+        if self.length is None:
+            self._lanes.dial(
+                self._url.host, self._url.port or PORTS[self._url.scheme], min(DIALLED, self.options.lanes)
+            )
         request = httpx.Request(
             "GET",
             self._url,

@@ -13,19 +13,18 @@ from typing import TYPE_CHECKING
 
 import httpx
 
+from .dialling import OneConnection
+
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
-KEEP_ALIVE = 4.0
-"""Seconds for which an idle connection is used again: below the 5 s of Apache and lighttpd."""
 CLOSING_SECONDS = 2.0
 
 
 def plain_transports(*, tls: bool) -> Callable[[], httpx.AsyncBaseTransport]:
     """Return what makes transports of one connection each; they share one TLS context, which is costly to make."""
-    context = httpx.create_ssl_context() if tls else False
-    limits = httpx.Limits(max_connections=1, max_keepalive_connections=1, keepalive_expiry=KEEP_ALIVE)
-    return lambda: httpx.AsyncHTTPTransport(verify=context, limits=limits)
+    context = httpx.create_ssl_context() if tls else None
+    return lambda: OneConnection(context)
 
 
 class Lane:
@@ -66,6 +65,14 @@ class Lanes:
                     self._discard(lane)
                 else:
                     self._idle.append(lane)
+
+    def dial(self, host: str, port: int, count: int) -> None:
+        """Open connections ahead of the requests that will need them, as far as the transports can."""
+        for _ in range(count - len(self._idle) - len(self._busy)):
+            lane = Lane(self._factory())
+            if isinstance(lane.transport, OneConnection):
+                lane.transport.dial(host, port)
+            self._idle.insert(0, lane)
 
     def renew(self, factory: Callable[[], httpx.AsyncBaseTransport] | None) -> None:
         """Use no lane of before again; make new ones by `factory`, if given."""

@@ -30,6 +30,7 @@ from pointlink.memory import Network
 from pointlink.origin import Origin, serve_origin
 from pointlink.resources import Resource
 from pointstream.stores import LocalStore, Store, is_address
+from pointstream.stores.dialling import OneConnection
 from pointstream.stores.http import HttpStore
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ async def open_link(target: str, profile: Profile, kind: ClockKind) -> AsyncIter
             yield lambda: HttpStore(
                 f"http://model.example{MODEL}",
                 clock=clock,
-                transports=lambda: network.transport(max_connections=1),
+                transports=lambda: OneConnection(backend=network, keep_alive=None),
             )
         elif free:
             yield (lambda: HttpStore(target, clock=clock)) if is_address(target) else lambda: LocalStore(Path(target))
