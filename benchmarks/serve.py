@@ -1,6 +1,6 @@
 """Print what a range costs our server, beside aiohttp's static route in the same run.
 
-    python benchmarks/serve.py [--requests 4000] [--connections 8] [--repeats 3] [--workers 2]
+    python benchmarks/serve.py [--requests 2000] [--connections 8] [--repeats 6] [--workers 2]
 
 Each server runs as a process of its own on loopback and serves the same file of random bytes. The visitor costs next to
 nothing, so that the server is what is measured: one thread keeps every connection busy, sends requests that were made
@@ -22,8 +22,13 @@ import subprocess
 import sys
 import tempfile
 import time
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 FILE_BYTES = 64 * 1024 * 1024
@@ -114,7 +119,9 @@ class Visitor:
         self._socket.close()
 
 
-def measure(code: str, arguments: list[str], size: int, options: argparse.Namespace) -> Figures:
+@contextmanager
+def running(code: str, arguments: list[str]) -> Iterator[tuple[int, int]]:
+    """A server as a process of its own; gives its process id and port."""
     path = os.pathsep.join(str(REPOSITORY / room) for room in ("common", "server", "client"))
     with subprocess.Popen(
         [sys.executable, "-c", code, *arguments],
@@ -124,55 +131,69 @@ def measure(code: str, arguments: list[str], size: int, options: argparse.Namesp
             assert server.stdout is not None
             found = re.search(r":(\d+)/", server.stdout.readline())
             assert found is not None
-            chance = random.Random(size)
-            visitors = [Visitor(int(found[1]), size, chance) for _ in range(options.connections)]
-            for warm in (True, False):
-                count = 20 if warm else max(20, options.requests // options.connections // (1 + size // (256 << 10)))
-                before, began = cpu_seconds(server.pid), time.perf_counter()
-                for _ in range(count):
-                    for visitor in visitors:
-                        visitor.take()
-                        visitor.ask()
-                wall = time.perf_counter() - began
-            done = count * len(visitors)
-            figures = Figures(rate=done / wall, cpu=(cpu_seconds(server.pid) - before) / done)
-            for visitor in visitors:
-                visitor.close()
-            return figures
+            yield server.pid, int(found[1])
         finally:
             server.terminate()
 
 
+def measure(pid: int, port: int, size: int, requests: int, connections: int) -> Figures:
+    chance = random.Random(size)
+    visitors = [Visitor(port, size, chance) for _ in range(connections)]
+    for count in (20, max(20, requests // connections // (1 + size // (256 << 10)))):  # the first time to warm up
+        before, began = cpu_seconds(pid), time.perf_counter()
+        for _ in range(count):
+            for visitor in visitors:
+                visitor.take()
+                visitor.ask()
+        wall = time.perf_counter() - began
+    done = count * len(visitors)
+    figures = Figures(rate=done / wall, cpu=(cpu_seconds(pid) - before) / done)
+    for visitor in visitors:
+        visitor.close()
+    return figures
+
+
+def best(figures: list[Figures]) -> Figures:
+    return Figures(rate=max(each.rate for each in figures), cpu=min(each.cpu for each in figures))
+
+
+def print_table(size: int, runs: dict[str, list[Figures]]) -> None:
+    print(f"\n{size >> 10:>4} KB ranges       requests/s    MB/s  CPU us/request  times static  CPU of static")
+    static = best(runs["aiohttp static"])
+    for label, figures in runs.items():
+        ours = best(figures)
+        print(
+            f"{label:<22} {ours.rate:>8.0f} {ours.rate * size / 1e6:>7.0f} {1e6 * ours.cpu:>15.0f}"
+            f" {ours.rate / static.rate:>12.2f}x {ours.cpu / static.cpu:>14.2f}x",
+            flush=True,
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--requests", type=int, default=4000)
+    parser.add_argument("--requests", type=int, default=2000, help="of each turn")
     parser.add_argument("--connections", type=int, default=8)
-    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--repeats", type=int, default=6)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--sizes", type=int, nargs="+", default=[4, 64, 256, 1024], help="KB")
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as name:
+    with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         (Path(name) / "model.lpc").write_bytes(os.urandom(FILE_BYTES))
         servers = {
-            "aiohttp static": (STATIC, [name]),
-            "pointserve, asyncio": (OURS, [name, "asyncio"]),
-            "pointserve, uvloop": (OURS, [name, "uvloop"]),
-            f"pointserve, {options.workers} workers": (OURS, [name, "uvloop", str(options.workers)]),
+            label: stack.enter_context(running(code, [name, *arguments]))
+            for label, code, arguments in (
+                ("aiohttp static", STATIC, []),
+                ("pointserve, asyncio", OURS, ["asyncio"]),
+                ("pointserve, uvloop", OURS, ["uvloop"]),
+                (f"pointserve, {options.workers} workers", OURS, ["uvloop", str(options.workers)]),
+            )
         }
         for size in (kilobytes << 10 for kilobytes in options.sizes):
             runs: dict[str, list[Figures]] = {label: [] for label in servers}
             for _ in range(options.repeats):
-                for label, (code, arguments) in servers.items():
-                    runs[label].append(measure(code, arguments, size, options))
-            print(f"\n{size >> 10:>4} KB ranges       requests/s    MB/s  CPU us/request  times static  CPU of static")
-            static = Figures(max(f.rate for f in runs["aiohttp static"]), min(f.cpu for f in runs["aiohttp static"]))
-            for label, figures in runs.items():
-                rate, cpu = max(f.rate for f in figures), min(f.cpu for f in figures)
-                print(
-                    f"{label:<22} {rate:>8.0f} {rate * size / 1e6:>7.0f} {1e6 * cpu:>15.0f}"
-                    f" {rate / static.rate:>12.2f}x {cpu / static.cpu:>14.2f}x",
-                    flush=True,
-                )
+                for label, (pid, port) in servers.items():
+                    runs[label].append(measure(pid, port, size, options.requests, options.connections))
+            print_table(size, runs)
 
 
 if __name__ == "__main__":
