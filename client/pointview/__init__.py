@@ -1,1 +1,1 @@
-"""Looking at models: camera, refinement, renderers, streaming reports."""
+"""Browse a model: camera, refinement, renderers, streaming experiments, and the commands of the viewer."""

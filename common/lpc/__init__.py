@@ -1,0 +1,1 @@
+"""The format .lpc, pure: samples, clouds, codec, header, index tree and byte layout. No I/O, no clock, no sibling."""

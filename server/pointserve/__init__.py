@@ -1,1 +1,1 @@
-"""The server: models of a folder over HTTP byte ranges. `app.make_app` is the whole of it as an application."""
+"""The HTTP server of models: byte ranges by the book, a catalogue, limits and figures."""
