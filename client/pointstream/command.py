@@ -38,11 +38,13 @@ SUMMARIES: Mapping[str, str] = {
     "doctor": "Say whether a host can serve models, and what to change.",
     "link": "Put a slow link in front of a server.",
     "stream": "Stream a model over a link and report what arrived when.",
-    "render": "Draw a model into a picture.",
+    "estimate": "Say what a view of a model will cost, in bytes and seconds.",
+    "render": "Draw a model into a picture, or a path into many.",
+    "view": "Open a window on a model.",
 }
 """Help by name, in the order of a first tour: what ``--help`` prints without importing anything."""
 
-EXTRAS: Mapping[str, str] = {"build": "server", "serve": "server", "sign": "server"}
+EXTRAS: Mapping[str, str] = {"build": "server", "serve": "server", "sign": "server", "view": "client,window"}
 """Extra of the distribution that a command needs; the others need ``client``."""
 
 OWN_PACKAGES = frozenset({"lpc", "pointbuild", "pointserve", "pointstream", "pointlink", "pointview"})

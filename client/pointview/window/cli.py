@@ -1,0 +1,94 @@
+"""``pointstream view``: options in, a window, and what it took."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pointstream.cli import CACHE, choose_cache
+from pointview.cli import MOST_THREADS, SizeType, ViewType, positive
+
+
+@click.command()
+@click.argument("model", required=False)
+@click.option("--size", type=SizeType(), default="1280x800", show_default=True, help="Size of the window.")
+@click.option("--view", type=ViewType(), help="Where to look from first; without it the whole model is framed.")
+@click.option(
+    "--tolerance",
+    type=float,
+    callback=positive,
+    default=1.0,
+    show_default=True,
+    help="Spacing of samples on the screen that is fine enough, pixels.",
+)
+@click.option("--budget", type=click.IntRange(min=1), help="Most splats.")
+@click.option("--backend", type=click.Choice(["auto", "gl", "cpu"]), default="auto", show_default=True)
+@click.option("--link", metavar="none|adsl|lan|RATE[,RTT]", help="See the model as over this line.")
+@click.option(
+    "--folder",
+    type=click.Path(path_type=Path, file_okay=False, exists=True),
+    default=Path(),
+    help="Where pictures and recorded paths go; the current directory if not given.",
+)
+@click.option(
+    "--seconds", type=float, callback=lambda c, p, v: v if v is None else positive(c, p, v), help="Close by itself."
+)
+@CACHE
+@click.option("--json", "as_json", is_flag=True, help="Print the figures of the session as one JSON object.")
+def view(
+    model: str | None,
+    size: tuple[int, int],
+    view: dict[str, Any] | None,
+    tolerance: float,
+    budget: int | None,
+    backend: Any,
+    link: str | None,
+    folder: Path,
+    seconds: float | None,
+    cache: str | None,
+    as_json: bool,
+) -> None:
+    """Open a window on MODEL, a path or address of a .lpc file; F1 shows the controls."""
+    from pointlink.profiles import parse_profile
+    from pointview.camera import Camera
+
+    from .feed import Feed
+    from .loop import run_loop
+    from .screen import Screen
+    from .settings import Settings
+    from .viewer import Viewer, ViewerOptions
+
+    profile = None
+    if link is not None:
+        try:
+            profile = parse_profile(link)
+        except ValueError as error:
+            raise click.BadParameter(str(error), param_hint="--link") from error
+    if view is not None:
+        Camera.from_view(view, width=size[0], height=size[1])
+    settings = Settings(tolerance=tolerance, help=model is None)
+    if budget is not None:
+        settings.budget, settings.limited = budget, True
+    options = ViewerOptions(backend=backend, threads=min(os.cpu_count() or 1, MOST_THREADS), folder=folder, view=view)
+
+    def open_feed(target: str) -> Feed:
+        return Feed(target, cache=choose_cache(cache, target), link=profile)
+
+    title = "pointstream" if model is None else f"{model} - pointstream"
+    with Screen(title, size) as screen:
+        viewer = Viewer(open_feed, options, settings)
+        try:
+            if model is not None:
+                viewer.open(model)
+            report = run_loop(screen, viewer, seconds=seconds)
+        finally:
+            viewer.close()
+    if as_json:
+        click.echo(json.dumps(asdict(report)))
+    elif viewer.mirror.index is None and viewer.message:
+        raise click.ClickException(viewer.message)

@@ -1,0 +1,201 @@
+"""The access layer in a thread of its own: frames never wait for the network, nor the network for frames.
+
+    frame loop                         feed's thread
+    ask(wants, pinned)  ─ a slot ────▶ end_frame(latest wants), every `TICK`
+    news()              ◀─ a deque ─── what came, what was dropped
+    stats               ◀─ a slot ──── counters
+
+Both hand-overs are single assignments and deque operations, which are atomic in Python: no lock that one side could
+hold while the other waits, and no call that could reach a socket or a disk. Of wants only the latest counts. The time
+that the frame loop spends in here is measured all the same (`longest_handover`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+import time
+from collections import deque
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lpc.errors import LpcError
+from pointlink.front import precise_loop
+from pointstream.layer import AccessLayer, LayerOptions
+from pointstream.stores import open_store
+from pointview.stream.network import open_link
+
+from .mirror import Came, Failed, Gone, News, Opened
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+    from numpy.typing import NDArray
+
+    from pointlink.profiles import Profile
+    from pointstream.cache import Cache
+    from pointstream.stats import LayerStats
+
+TICK = 1 / 60
+"""Seconds between two looks at the wants."""
+
+MOST_NEWS = 512
+"""News that one frame takes in: a fast disk must not turn a frame into an upload of everything."""
+
+PATIENCE = 5.0
+"""Seconds that closing waits for the thread."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ask:
+    """What the latest frame wants and draws."""
+
+    build: int
+    wants: NDArray[np.int64]
+    pinned: NDArray[np.int64]
+
+
+class Feed:
+    """What comes from one model.
+
+    Parameters
+    ----------
+    target : str
+        Path or address.
+    cache : Cache, optional
+    link : Profile, optional
+        Put this link before the model.
+    capacity : int
+        Bytes of decoded clouds.
+
+    Attributes
+    ----------
+    thread : int
+        Identity of the feed's thread.
+    longest_handover : float
+        Longest time that a call from the frame loop took, seconds.
+    """
+
+    def __init__(
+        self,
+        target: str,
+        *,
+        cache: Cache | None = None,
+        link: Profile | None = None,
+        capacity: int = LayerOptions().capacity,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.target, self._cache, self._link = target, cache, link
+        self._options, self._clock = LayerOptions(capacity=capacity), clock
+        self._news: deque[News] = deque()
+        self._ask: Ask | None = None
+        self._stats: LayerStats | None = None
+        self._wanting = True
+        self._closing = False
+        self.longest_handover = 0.0
+        self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
+        self._thread.start()
+        self.thread = self._thread.ident
+
+    # What the frame loop calls.
+
+    def ask(self, build: int, wants: NDArray[np.int64], pinned: NDArray[np.int64]) -> None:
+        """Replace what is wanted."""
+        start = self._clock()
+        self._ask = Ask(build, wants, pinned)
+        self._handed_over(start)
+
+    def news(self) -> list[News]:
+        """Take the oldest news, `MOST_NEWS` at most."""
+        start = self._clock()
+        taken: list[News] = []
+        with contextlib.suppress(IndexError):
+            while len(taken) < MOST_NEWS:
+                taken.append(self._news.popleft())
+        self._handed_over(start)
+        return taken
+
+    @property
+    def stats(self) -> LayerStats | None:
+        """Counters as of the last tick; None until the model is open."""
+        return self._stats
+
+    @property
+    def wanting(self) -> bool:
+        """Whether anything that the last frame wanted can still come."""
+        return self._wanting
+
+    def close(self) -> None:
+        """Stop the thread; the only call that waits for it."""
+        self._closing = True
+        self._thread.join(PATIENCE)
+
+    def _handed_over(self, start: float) -> None:
+        self.longest_handover = max(self.longest_handover, self._clock() - start)
+
+    # What runs on the feed's thread.
+
+    def _run(self) -> None:
+        with asyncio.Runner(loop_factory=precise_loop) as runner:
+            try:
+                runner.run(self._until_closed())
+            except (LpcError, OSError) as error:
+                self._news.append(Failed(" ".join(str(error).split())))
+                self._wanting = False
+
+    async def _until_closed(self) -> None:
+        """Feed until `close`, which may come while a host does not answer."""
+        feeding = asyncio.ensure_future(self._feed())
+        try:
+            while not (self._closing or feeding.done()):
+                await asyncio.wait([feeding], timeout=TICK)
+            if feeding.done():
+                feeding.result()
+        finally:
+            feeding.cancel()
+            with contextlib.suppress(asyncio.CancelledError, LpcError, OSError):
+                await feeding
+
+    async def _feed(self) -> None:
+        async with self._layer() as layer:
+            posted: NDArray[np.bool_] = np.zeros(0, dtype=bool)
+            build = 0
+            while True:
+                stats = layer.stats
+                if stats.build != build:
+                    build, posted = stats.build, np.zeros(layer.header.nodes, dtype=bool)
+                    self._news.append(Opened(layer.index, build))
+                ask = self._ask
+                if ask is not None and ask.build == build:
+                    layer.end_frame(ask.wants, pinned=ask.pinned)
+                posted = self._post(layer, posted)
+                self._stats, self._wanting = stats, layer.wanting
+                await asyncio.sleep(TICK)
+
+    @contextlib.asynccontextmanager
+    async def _layer(self) -> AsyncIterator[AccessLayer]:
+        async with AsyncExitStack() as stack:
+            if self._link is None:
+                store = open_store(self.target, clock=self._clock, cache=self._cache)
+            else:
+                store = (await stack.enter_async_context(open_link(self.target, self._link, "real")))()
+            layer = await AccessLayer.open(store, options=self._options, clock=self._clock)
+            stack.push_async_callback(layer.close)
+            yield layer
+
+    def _post(self, layer: AccessLayer, posted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Post what changed since `posted`; returns what is resident now."""
+        resident = layer.resident.copy()
+        changed = np.flatnonzero(resident != posted)
+        if len(changed) == 0:
+            return posted
+        gone = changed[~resident[changed]]
+        if len(gone):
+            self._news.append(Gone(tuple(gone.tolist())))
+        for node in changed[resident[changed]].tolist():
+            self._news.append(Came(node, layer.take(node)))
+        return resident

@@ -1,0 +1,83 @@
+"""The renderer on a thread of its own, and how it is told of models and colour modes.
+
+An OpenGL context belongs to one thread, and the window has one already: on its own thread the renderer's context is
+always the current one. A frame waits for its picture there, never for data: all clouds of the cut are in memory.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING
+
+from pointview.colouring import Colouring, Mode, available_modes
+from pointview.render import Kind, open_backend
+from pointview.render.picture import tint_starved
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from pointview.camera import Camera
+    from pointview.refine import Cut
+    from pointview.render import Backend, Frame
+
+    from .mirror import Mirror
+    from .settings import Settings
+
+
+class Painter:
+    """Draws cuts of the model that is open, in the colours that are chosen.
+
+    Attributes
+    ----------
+    colouring : Colouring or None
+        The present mode; None before the first frame.
+    """
+
+    def __init__(self, kind: Kind, *, threads: int) -> None:
+        self._kind, self._threads = kind, threads
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="paint")
+        self._backend: Backend | None = None
+        self._key: tuple[object, ...] = ()
+        self.colouring: Colouring | None = None
+
+    @property
+    def name(self) -> str:
+        """What draws."""
+        return "" if self._backend is None else self._backend.name
+
+    def draw(self, cut: Cut, mirror: Mirror, camera: Camera, settings: Settings) -> Frame:
+        """Draw a cut of what the mirror holds."""
+        return self._thread.submit(self._draw, cut, mirror, camera, settings).result()
+
+    def close(self) -> None:
+        """Give back the renderer's memory and contexts."""
+        self._thread.submit(self._forget).result()
+        self._thread.shutdown()
+
+    def _draw(self, cut: Cut, mirror: Mirror, camera: Camera, settings: Settings) -> Frame:
+        backend, colouring = self._prepared(mirror, settings.mode)
+        return backend.draw(cut, lambda node: colouring.cloud(node, mirror.take(node)), camera, settings.style())
+
+    def _prepared(self, mirror: Mirror, asked: Mode) -> tuple[Backend, Colouring]:
+        """Return renderer and colours; made anew when model, build or mode changed."""
+        modes = available_modes(mirror.header)
+        mode = asked if asked in modes else modes[0]
+        key = (id(mirror.index), mirror.build, mode, 0 in mirror.clouds)
+        if self._backend is None or self.colouring is None or key != self._key:
+            self._forget()
+            assert mirror.index is not None
+            self.colouring = Colouring(mode, mirror.header, mirror.index, mirror.clouds.get(0))
+            self._backend = open_backend(self._kind, self.colouring.header, threads=self._threads)
+            self._key = key
+        return self._backend, self.colouring
+
+    def _forget(self) -> None:
+        if self._backend is not None:
+            self._backend.close()
+        self._backend = None
+
+
+def shown(frame: Frame, settings: Settings) -> NDArray[np.uint8]:
+    """Pixels of a frame as the settings want them, (h, w, 3) uint8."""
+    return tint_starved(frame) if settings.tint else frame.rgb

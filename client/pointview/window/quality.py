@@ -1,0 +1,70 @@
+"""Tolerance and cut of the next frame: what is asked for, kept within the budget and the frame time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pointview.budget import tolerance_for_budget
+from pointview.feedback import Feedback
+from pointview.refine import Cut, refine
+
+if TYPE_CHECKING:
+    from pointview.camera import Camera
+
+    from .mirror import Mirror
+    from .settings import Settings
+
+STILL = 6.0
+"""Frame times that a frame of a camera at rest may take: nobody steers it."""
+
+
+@dataclass(slots=True)
+class Quality:
+    """The tolerance from frame to frame: one while the camera moves, one for when it rests."""
+
+    moving: Feedback
+    resting: Feedback
+
+    @classmethod
+    def at(cls, tolerance: float) -> Quality:
+        """Start at a tolerance in pixels."""
+        return cls(moving=Feedback(tolerance=tolerance), resting=Feedback(tolerance=tolerance))
+
+    def cut(self, mirror: Mirror, camera: Camera, settings: Settings, *, moving: bool) -> Cut:
+        """Compute the cut of a frame."""
+        assert mirror.index is not None
+        tolerance, one_sided = settings.tolerance, not settings.two_sided
+        if settings.steady:
+            tolerance = max(tolerance, (self.moving if moving else self.resting).tolerance)
+        if settings.limited:
+            tolerance = tolerance_for_budget(
+                mirror.index, camera, settings.budget, mirror.index.known, at_least=tolerance, cull_backfaces=one_sided
+            )
+        return refine(mirror.index, camera, tolerance, mirror.resident, cull_backfaces=one_sided)
+
+    def took(self, seconds: float, settings: Settings, *, moving: bool) -> bool:
+        """Take in what a frame took; True if a camera at rest should be drawn again, with another tolerance."""
+        finest, allowed = settings.tolerance, settings.frame_seconds
+        if not settings.steady:
+            self.moving = self.resting = Feedback(tolerance=finest)
+            return False
+        if moving:
+            self.moving = self.moving.step(seconds, allowed=allowed, finest=finest, moved=True)
+            self.resting = Feedback(tolerance=min(self.resting.tolerance, self.moving.tolerance))
+            return False
+        before = self.resting.tolerance
+        self.resting = self.resting.step(seconds, allowed=allowed * STILL, finest=finest, moved=False)
+        return self.resting.tolerance != before
+
+
+def loaded_bytes(mirror: Mirror, camera: Camera, settings: Settings) -> tuple[int, int]:
+    """Bytes of the view's clouds that are here, and of all that it will have as far as the index tells."""
+    if mirror.index is None:
+        return 0, 0
+    one_sided = not settings.two_sided
+    goal = refine(mirror.index, camera, settings.tolerance, mirror.index.known, cull_backfaces=one_sided).nodes
+    sizes = mirror.index.size[goal]
+    return int(sizes[mirror.resident[goal]].sum()), int(np.sum(sizes))

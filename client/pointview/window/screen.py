@@ -1,0 +1,217 @@
+"""The window: a glfw window, the picture on it as a texture, and Dear ImGui's frame around the panel."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Self
+
+import glfw
+import moderngl
+from imgui_bundle import imgui
+from imgui_bundle.python_backends.glfw_backend import GlfwRenderer
+
+from lpc.errors import Unavailable
+
+from .inputs import Inputs
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+IDLE = 1 / 60
+"""Seconds that a frame without anything to do waits for input."""
+
+KEY_NAMES = {
+    **{letter: letter for letter in "abcdefgpqrstwxyzv"},
+    **{digit: f"_{digit}" for digit in "123456"},
+    "home": "home", "tab": "tab", "f1": "f1", "f12": "f12", "?": "slash", "[": "left_bracket", "]": "right_bracket",
+    "escape": "escape",
+}  # fmt: skip
+"""Our names of keys, and Dear ImGui's."""
+
+VERTEX = """#version 330
+out vec2 at;
+void main() {
+    vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2.0;
+    at = vec2(corner.x, 1.0 - corner.y);
+    gl_Position = vec4(corner * 2.0 - 1.0, 0.0, 1.0);
+}"""
+
+FRAGMENT = """#version 330
+uniform sampler2D picture;
+in vec2 at;
+out vec4 color;
+void main() { color = texture(picture, at); }"""
+
+
+class Screen:
+    """An open window. Made, used and closed on the main thread.
+
+    Parameters
+    ----------
+    title : str
+    size : (int, int)
+        Width and height, screen coordinates.
+    visible : bool
+
+    Raises
+    ------
+    Unavailable
+        If there is no display, or it has no OpenGL 3.3.
+    """
+
+    def __init__(self, title: str, size: tuple[int, int], *, visible: bool = True) -> None:
+        problems: list[str] = []
+        glfw.set_error_callback(lambda _code, text: problems.append(_text(text)))
+        if not glfw.init():
+            raise Unavailable(f"no window can be opened here ({'; '.join(problems)}); `pointstream render` needs none")
+        for hint, value in (
+            (glfw.CONTEXT_VERSION_MAJOR, 3),
+            (glfw.CONTEXT_VERSION_MINOR, 3),
+            (glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE),
+            (glfw.OPENGL_FORWARD_COMPAT, True),
+            (glfw.VISIBLE, visible),
+        ):
+            glfw.window_hint(hint, value)
+        self._window = glfw.create_window(*size, title, None, None)
+        if not self._window:
+            glfw.terminate()
+            raise Unavailable(f"no OpenGL 3.3 window can be opened here: {'; '.join(problems)}")
+        glfw.make_context_current(self._window)
+        glfw.swap_interval(1)
+        self._context = moderngl.create_context()
+        program = self._context.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
+        self._blit = self._context.vertex_array(program, [])
+        self._texture: Any = None
+        imgui.create_context()
+        imgui.get_io().set_ini_filename("")  # leaves no file behind
+        imgui.get_style().window_rounding = 4.0
+        self._imgui = GlfwRenderer(self._window, attach_callbacks=True)
+        self._dropped: list[str] = []
+        drop: Any = self._drop  # typed as one path by the stubs; it is a list
+        glfw.set_drop_callback(self._window, drop)
+        self._shown_at = glfw.get_time()
+
+    @property
+    def closing(self) -> bool:
+        """Whether the window was asked to close."""
+        return bool(glfw.window_should_close(self._window))
+
+    @property
+    def renderer(self) -> str:
+        """What OpenGL calls the graphics hardware of the window."""
+        return str(self._context.info["GL_RENDERER"])
+
+    def ask_to_close(self) -> None:
+        """Make `closing` true."""
+        glfw.set_window_should_close(self._window, True)
+
+    def rename(self, title: str) -> None:
+        """Give the window another title."""
+        glfw.set_window_title(self._window, title)
+
+    def wait(self, *, busy: bool) -> None:
+        """Collect input; without anything to do, wait a moment for it."""
+        if busy:
+            glfw.poll_events()
+        else:
+            glfw.wait_events_timeout(IDLE)
+
+    def begin(self) -> Inputs:
+        """Begin a frame of the panel and return what was done to the picture."""
+        inputs: Any = self._imgui  # its methods carry no types
+        inputs.process_inputs()
+        imgui.new_frame()
+        now = glfw.get_time()
+        seconds, self._shown_at = now - self._shown_at, now
+        io, dropped = imgui.get_io(), tuple(self._dropped)
+        self._dropped.clear()
+        width, height = glfw.get_framebuffer_size(self._window)
+        ratio = width / max(1.0, io.display_size.x)
+        mouse, keyboard = not io.want_capture_mouse, not io.want_text_input
+
+        def dragged(*buttons: int) -> tuple[float, float]:
+            if not mouse or not any(imgui.is_mouse_down(button) for button in buttons):
+                return 0.0, 0.0
+            return io.mouse_delta.x * ratio, io.mouse_delta.y * ratio
+
+        pressed, held = _keys() if keyboard else (frozenset[str](), frozenset[str]())
+        if "paste" in pressed:
+            dropped = (*dropped, *self._clipboard())
+        return Inputs(
+            seconds=seconds,
+            size=(max(1, width), max(1, height)),
+            cursor=(io.mouse_pos.x * ratio, io.mouse_pos.y * ratio),
+            turned=dragged(0) if not io.key_shift else (0.0, 0.0),
+            shifted=dragged(1, 2) if not io.key_shift else dragged(0, 1, 2),
+            wheel=float(io.mouse_wheel) if mouse else 0.0,
+            picked=mouse and imgui.is_mouse_double_clicked(0),
+            pressed=pressed,
+            held=held,
+            dropped=dropped,
+        )
+
+    def show(self, rgb: NDArray[np.uint8]) -> None:
+        """Replace the picture."""
+        size = (rgb.shape[1], rgb.shape[0])
+        if self._texture is None or self._texture.size != size:
+            if self._texture is not None:
+                self._texture.release()
+            self._texture = self._context.texture(size, 3, alignment=1)
+        self._texture.write(rgb)
+
+    def end(self) -> None:
+        """Put picture and panel on the screen."""
+        imgui.render()
+        target = self._context.screen
+        target.use()
+        self._context.viewport = (0, 0, *glfw.get_framebuffer_size(self._window))
+        self._context.disable(moderngl.BLEND | moderngl.DEPTH_TEST | moderngl.CULL_FACE)
+        target.clear()
+        if self._texture is not None:
+            self._texture.use(0)
+            self._blit.render(moderngl.TRIANGLES, vertices=3)
+        self._imgui.render(imgui.get_draw_data())
+        glfw.swap_buffers(self._window)
+
+    def close(self) -> None:
+        """Close the window."""
+        self._imgui.shutdown()
+        imgui.destroy_context()
+        self._context.release()
+        glfw.destroy_window(self._window)
+        glfw.terminate()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _clipboard(self) -> tuple[str, ...]:
+        text = _text(glfw.get_clipboard_string(self._window) or "").strip()
+        return (text,) if text else ()
+
+    def _drop(self, _window: Any, paths: Any) -> None:
+        self._dropped.extend(str(path) for path in paths)
+
+
+def _text(value: Any) -> str:
+    """Return a text of glfw, which comes as bytes."""
+    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
+
+
+def _keys() -> tuple[frozenset[str], frozenset[str]]:
+    """Keys that went down in this frame, and keys that are down; Ctrl makes commands of them."""
+    io = imgui.get_io()
+
+    def those(test: Callable[[Any], bool]) -> set[str]:
+        return {name for name, key in KEY_NAMES.items() if test(getattr(imgui.Key, key))}
+
+    pressed = those(lambda key: imgui.is_key_pressed(key, False))
+    if io.key_ctrl:
+        commands = {"v": "paste", "q": "quit"}
+        return frozenset(commands[name] for name in pressed & commands.keys()), frozenset()
+    held = those(imgui.is_key_down) | ({"shift"} if io.key_shift else set())
+    return frozenset(pressed), frozenset(held)
