@@ -4,11 +4,16 @@ The spacing of a region is sqrt(pi / 8) times the median distance to the eighth 
 eight samples of area r^2 each. (The mean distance to the *nearest* neighbour is about half of it.) Regions are cells
 of at most 2 M samples. What a region holds does not depend on buckets or thresholds, so neither does the result.
 
+Two kinds of regions have no area to speak of. Along a straight line the eight neighbours lie on both sides, so the spacing
+is a quarter of the distance. A model of fewer than `FEWEST` samples has the smallest distance of any two of them: half
+of it, the position error, then keeps them apart.
+
 Surface adds up: an inner cell has the area of its halves. A cell of few samples takes the density of its sibling.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +27,11 @@ if TYPE_CHECKING:
 
 NEIGHBOURS = 8
 FEWEST = 32
-"""Samples of a region that is measured."""
+"""Samples of a region that is measured by its neighbours."""
+STRAIGHT = 0.25
+"""Of the spacing along a line: samples further from it make a surface."""
+CLOSEST = 2.0**-40
+"""Of the extent: closer samples of a small model do not count as two."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,10 +114,33 @@ def measure(
     spacing = np.full(count, np.nan)
     measured = np.flatnonzero(region & ((high - low >= FEWEST) | (level == 0)))
     faces = cells.faces(fixed[low[measured]], level[measured])
+    pile = high[measured] - low[measured] > probing.region
+    for cell, box in zip(measured[pile].tolist(), faces[pile], strict=True):
+        here = slice(low[cell], high[cell])
+        first = here.start + np.argsort(priority[here])[: probing.region]
+        spacing[cell] = pile_spacing(xyz[first], priority[first], box, probing, here.stop - here.start)
+    measured, faces = measured[~pile], faces[~pile]
     _probe(xyz, priority, low[measured], high[measured], faces, probing.queries, measured, spacing)
     area = spacing**2 * (high - low)
     _add_up(low, high, parent, region, area)
     return Areas(low, high, area, region, spacing)
+
+
+def pile_spacing(
+    xyz: NDArray[np.float64],
+    priority: NDArray[np.uint64],
+    face: NDArray[np.float64],
+    probing: Probing,
+    samples: int,
+) -> float:
+    """Spacing of `samples` that no path tells apart, from a region's number of them in the order of their priorities.
+
+    Most piles are at one place exactly, but where an outlier has made the root large they may be a whole surface.
+    """
+    spacing = np.empty(1)
+    low, high = np.zeros(1, np.int64), np.array([len(xyz)])
+    _probe(xyz, priority, low, high, face[None], probing.queries, low, spacing)
+    return float(spacing[0]) * math.sqrt(len(xyz) / samples)
 
 
 @njit(cache=True, nogil=True)
@@ -156,6 +188,9 @@ def _probe(xyz: Any, priority: Any, lows: Any, highs: Any, faces: Any, queries: 
     for r in range(len(lows)):
         low, high = lows[r], highs[r]
         x, y, z = xyz[low:high, 0].copy(), xyz[low:high, 1].copy(), xyz[low:high, 2].copy()
+        if high - low < FEWEST:
+            spacing[cell[r]] = _smallest_distance(x, y, z)
+            continue
         squared = np.empty(high - low)
         count = 0
         for i in range(low, high):  # the samples of smallest priority
@@ -197,7 +232,53 @@ def _probe(xyz: Any, priority: Any, lows: Any, highs: Any, faces: Any, queries: 
                     kept += 1
             count = kept
         ordered = np.sort(distance[:count])
-        spacing[cell[r]] = (ordered[(count - 1) // 2] + ordered[count // 2]) / 2.0
+        across = (ordered[(count - 1) // 2] + ordered[count // 2]) / 2.0
+        along = across * 2.0 / np.sqrt(np.pi * 8)
+        spacing[cell[r]] = along if _width(x, y, z) < STRAIGHT * along else across
+
+
+@njit(cache=True, nogil=True)
+def _smallest_distance(x: Any, y: Any, z: Any) -> float:
+    """Distance of the two closest samples that do not coincide; 0 if all do."""
+    smallest, largest = np.inf, 0.0
+    for i in range(len(x)):
+        for j in range(i):
+            value = np.sqrt((x[i] - x[j]) ** 2 + (y[i] - y[j]) ** 2 + (z[i] - z[j]) ** 2)
+            largest = max(largest, value)
+    for i in range(len(x)):
+        for j in range(i):
+            value = np.sqrt((x[i] - x[j]) ** 2 + (y[i] - y[j]) ** 2 + (z[i] - z[j]) ** 2)
+            if value > CLOSEST * largest:
+                smallest = min(smallest, value)
+    return smallest if largest > 0.0 else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _width(x: Any, y: Any, z: Any) -> float:
+    """Largest distance from the line through two samples that are far apart."""
+    a = _farthest(x, y, z, 0)
+    b = _farthest(x, y, z, a)
+    ux, uy, uz = x[b] - x[a], y[b] - y[a], z[b] - z[a]
+    length = np.sqrt(ux * ux + uy * uy + uz * uz)
+    if length == 0.0:
+        return 0.0
+    ux, uy, uz = ux / length, uy / length, uz / length
+    widest = 0.0
+    for i in range(len(x)):
+        dx, dy, dz = x[i] - x[a], y[i] - y[a], z[i] - z[a]
+        cx, cy, cz = dy * uz - dz * uy, dz * ux - dx * uz, dx * uy - dy * ux
+        widest = max(widest, cx * cx + cy * cy + cz * cz)
+    return np.sqrt(widest)
+
+
+@njit(cache=True, nogil=True)
+def _farthest(x: Any, y: Any, z: Any, start: int) -> int:
+    best, farthest = start, 0.0
+    for i in range(len(x)):
+        value = (x[i] - x[start]) ** 2 + (y[i] - y[start]) ** 2 + (z[i] - z[start]) ** 2
+        if value > farthest:
+            best, farthest = i, value
+    return best
 
 
 @njit(cache=True, nogil=True)

@@ -12,6 +12,7 @@ from lpc.octahedral import decode_normals
 
 from .areas import Probing, measure
 from .rows import as_words
+from .spool import write_all
 from .tree import Tree, grow
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
     from .cells import Cells
     from .plan import Bucket
-    from .scatter import Regions
+    from .rows import Rows
 
 INDEX_BITS = 22
 MAX_BUCKET = 1 << INDEX_BITS
@@ -121,10 +122,10 @@ def partition(
     cells: Cells,
     probing: Probing,
     cloud_size: int,
-    regions: Regions,
+    regions: Rows,
     normals: NDArray[np.int32] | None,
 ) -> BucketTree:
-    """Sort a bucket's rows by node, in place on disk; `Regions.settle` may be called once the result is safe.
+    """Sort a bucket's rows by node, in place on disk; `Rows.settle` may be called once the result is safe.
 
     Parameters
     ----------
@@ -134,8 +135,8 @@ def partition(
         Upper nodes from the root to the bucket, and up to which priority each takes samples.
     cells, probing, cloud_size
         How to divide and measure.
-    regions : Regions
-        The file.
+    regions : Rows
+        Where they are.
     normals : ndarray or None
         `normal_table`, if rows have normals.
     """
@@ -158,8 +159,9 @@ def partition(
     del owner, group, priority
     out = np.empty_like(rows)
     np.take(as_words(rows), order, axis=0, out=as_words(out), mode="clip")  # "raise" would copy once more
-    clouds = _clouds(out, ends - counts, counts, normals)
-    regions.replace(first_row, out)
+    clouds = summarise(out, ends - counts, counts, normals)
+    with regions.rewriting(first_row) as file:
+        write_all(file, out, 0)
     clouds.first[:] += first_row
     used = np.flatnonzero(counts[: len(above)])
     measured = np.flatnonzero(areas.region & (areas.spacing > 0))
@@ -180,8 +182,6 @@ def sort_by_path(rows: NDArray[Any], cells: Cells, bucket: Bucket) -> tuple[NDAr
 
     Rows of equal paths come in any order.
     """
-    if bucket.coincident:
-        return rows, np.empty(len(rows), np.uint64)
     window = cells.window(bucket.depth, 64 - INDEX_BITS)
     packed = cells.keys(rows["xyz"], window)
     _pack(packed)
@@ -264,9 +264,10 @@ def _order(group: Any, place: Any, order: Any) -> None:
         place[group[i]] += 1
 
 
-def _clouds(
+def summarise(
     rows: NDArray[Any], first: NDArray[np.int64], samples: NDArray[np.int64], normals: NDArray[np.int32] | None
 ) -> Clouds:
+    """Box and sum the normals of runs of rows."""
     box = np.empty((len(first), 6))
     sums, bare = np.zeros((len(first), 3), np.int64), np.zeros(len(first), np.int64)
     _boxes(rows["xyz"], first, samples, box)

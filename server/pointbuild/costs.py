@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zstandard
 
 from lpc.channels import channels_of
+from lpc.header import seal
 from lpc.payload import parse_layout
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from numpy.typing import NDArray
+
     from lpc.attributes import Schema
+    from lpc.header import Header
 
 KINDS = ("position", "normal", "color", "other")
+
+DIGITS = (4, 5, 6, 7, 8, 9, 10, 3, 2)
+"""Decimals of the parts, in the order in which they are tried."""
+ROUNDS = 8
+"""In which a length settles, or never."""
 
 _BLOCK_HEADER = 3
 _LARGEST_BLOCK = 1 << 17
@@ -46,22 +56,41 @@ def cloud_costs(frame: bytes, samples: int, schema: Schema) -> dict[str, float]:
     return costs
 
 
-def bits_per_sample(parts: Mapping[str, float], cloud_bytes: int, index_bytes: int, samples: int) -> dict[str, float]:
-    """Scale the costs of some clouds to the whole file.
+def bits_per_sample(
+    parts: Mapping[str, float], cloud_bytes: int, file_bytes: int, samples: int, *, digits: int = DIGITS[0]
+) -> dict[str, float]:
+    """Scale the costs of some clouds to the whole file; what is no cloud is ``index``: the pages and the header.
 
     Parameters
     ----------
     parts : mapping
         Summed `cloud_costs` of some clouds.
-    cloud_bytes, index_bytes : int
-        Of all clouds and of all pages.
+    cloud_bytes, file_bytes : int
+        Of all clouds and of the file.
     samples : int
+    digits : int
+        Decimals of the parts; the total has all.
     """
     scale = 8 * cloud_bytes / samples / sum(parts.values())
-    bits = {name: parts[name] * scale for name in KINDS}
-    bits["index"] = 8 * index_bytes / samples
-    bits["total"] = sum(bits.values())
-    return {name: round(float(value), 4) for name, value in bits.items()}
+    bits = {name: float(parts[name]) * scale for name in KINDS}
+    bits["index"] = 8 * (file_bytes - cloud_bytes) / samples
+    return {name: round(value, digits) for name, value in bits.items()} | {"total": 8 * file_bytes / samples}
+
+
+def seal_with_costs(header: Header, records: NDArray[Any], parts: Mapping[str, float], cloud_bytes: int) -> Header:
+    """Seal a header that states what its own file costs a sample, itself included.
+
+    Digits of the numbers lengthen the header, which changes the numbers. Where no length states itself, some more
+    decimals of the parts find one.
+    """
+    for digits in DIGITS:
+        sealed = seal(header, records)
+        for _ in range(ROUNDS):
+            bits = bits_per_sample(parts, cloud_bytes, sealed.bytes, header.samples, digits=digits)
+            if bits == sealed.bits_per_sample:
+                return sealed
+            sealed = seal(replace(header, bits_per_sample=bits), records)
+    return sealed
 
 
 def _stored(frame: bytes, pieces: list[int]) -> list[float]:

@@ -59,9 +59,13 @@ def free_bytes(folder: Path) -> int:
 
 @contextmanager
 def translated(out: Path) -> Iterator[None]:
-    """Turn a full disk into a BuildError."""
+    """Turn a full disk, or less memory than was allowed, into a BuildError."""
     try:
         yield
+    except MemoryError as error:
+        raise BuildError(
+            f"the system gave less memory than the build of {out} may use: lower --memory, or raise the system's limit"
+        ) from error
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             raise BuildError(f"the disk is full while building {out}: make room, or use --scratch") from error

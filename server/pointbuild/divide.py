@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .areas import Probing
 from .assemble import Nodes, assemble
 from .bucket import BucketTree, normal_table, partition
+from .pile import check_piles, partition_pile
 from .plan import Plan, make_plan
 from .rows import row_dtype
 from .scatter import Candidates, Regions, Scattered, gather, scatter
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     from .cells import Cells
     from .folder import Folder
     from .progress import Progress
+    from .rows import Rows
     from .spool import Block, Spool
     from .work import Crew
 
@@ -37,10 +40,11 @@ GATHERED = 1 << 16
 
 @dataclass(frozen=True, slots=True)
 class Division:
-    """The tree, and r of the whole model (model units)."""
+    """The tree, r of the whole model (model units), and the rows sorted by node."""
 
     nodes: Nodes
     spacing: float
+    rows: Rows
 
 
 def divide(
@@ -64,7 +68,7 @@ def divide(
     spool, cells
         The samples, which are used up, and how their box is divided.
     regions : Regions
-        Gets the rows, in the end sorted by node.
+        Gets the rows.
     schema : Schema
         The attributes that rows carry.
     cloud_size, seed : int
@@ -81,6 +85,7 @@ def divide(
     probing = Probing.of(spool.samples, cloud_size)
     most = max(bucket_samples, probing.region)
     plan = _count(spool, cells, most, folder, crew, progress)
+    check_piles(plan.buckets)
     regions.lay_out(row_dtype(schema), [bucket.count for bucket in plan.buckets])
     regions.restore()
     limits = candidate_limits(plan, cloud_size, slack)
@@ -89,11 +94,12 @@ def divide(
         slack *= 4
         limits = candidate_limits(plan, cloud_size, slack)
         candidates = gather(regions, limits, GATHERED)
-    trees = _partition(plan, upper, cells, probing, cloud_size, schema, regions, folder, crew, progress)
+    rows = crew.share(regions, folder)
+    trees = _partition(plan, upper, cells, probing, most, cloud_size, schema, rows, folder, crew, progress)
     spacing = model_spacing(
         np.concatenate([tree.spacing for tree in trees]), np.concatenate([tree.weight for tree in trees])
     )
-    return Division(assemble(plan, upper, trees), spacing)
+    return Division(assemble(plan, upper, trees), spacing, rows.replaced())
 
 
 def _count(spool: Spool, cells: Cells, most: int, folder: Folder, crew: Crew, progress: Progress) -> Plan:
@@ -147,39 +153,45 @@ def _partition(
     upper: Upper,
     cells: Cells,
     probing: Probing,
+    most: int,
     cloud_size: int,
     schema: Schema,
-    regions: Regions,
+    rows: Rows,
     folder: Folder,
     crew: Crew,
     progress: Progress,
 ) -> list[BucketTree]:
-    progress.stage("partition", int(regions.first[-1]))
+    progress.stage("partition", int(rows.first[-1]))
     has_normals = any(attribute.name == "normal" for attribute in schema)
     table = normal_table(NORMAL_BITS) if has_normals else None
 
-    def one(number: int) -> BucketTree:
-        above = upper.above(number)
-        return partition(
-            int(regions.first[number]),
-            plan.buckets[number],
-            above,
-            [upper.nodes[node].threshold for node in above],
-            cells=cells,
-            probing=probing,
-            cloud_size=cloud_size,
-            regions=regions,
-            normals=table,
-        )
-
+    one = partial(
+        _partition_bucket,
+        plan=plan,
+        upper=upper,
+        most=most,
+        cells=cells,
+        probing=probing,
+        cloud_size=cloud_size,
+        regions=rows,
+        normals=table,
+    )
     journal = folder.journal("partition")
     trees: list[BucketTree] = []
     for arrays in journal:
         progress.advance(plan.buckets[len(trees)].count)
         trees.append(BucketTree.from_arrays(arrays))
-    for number, tree in crew.map(one, range(len(trees), len(plan.buckets))):
+    for number, tree in crew.spread(one, range(len(trees), len(plan.buckets))):
         trees.append(tree)
         journal.add(*tree.arrays())
-        regions.settle(int(regions.first[number]))
+        rows.settle(int(rows.first[number]))
         progress.advance(plan.buckets[number].count)
     return trees
+
+
+def _partition_bucket(number: int, *, plan: Plan, upper: Upper, regions: Rows, most: int, **shared: Any) -> BucketTree:
+    bucket, above = plan.buckets[number], upper.above(number)
+    first, limits = int(regions.first[number]), [upper.nodes[node].threshold for node in above]
+    if bucket.coincident:
+        return partition_pile(first, bucket, above, limits, most=most, regions=regions, **shared)
+    return partition(first, bucket, above, limits, regions=regions, **shared)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from lpc.attributes import Schema
 
     from .assemble import Nodes
-    from .scatter import Regions
+    from .rows import Rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ def encode_run(
     *,
     nodes: Nodes,
     geometry: Geometry,
-    regions: Regions,
+    regions: Rows,
     schema: Schema,
     effort: Effort,
     table: NDArray[np.float32] | None,

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, BinaryIO
+from functools import partial
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
 from lpc.errors import BuildError
-from lpc.header import Header, seal
-from lpc.lattice import SLACK, position_error_bound, position_step
-from lpc.page import PAGE_HEADER, RECORD
+from lpc.header import Header
+from lpc.lattice import EPSILON, SLACK, position_error_bound, position_step
 
-from .costs import KINDS, bits_per_sample, cloud_costs
+from .costs import KINDS, cloud_costs, seal_with_costs
 from .encode import Geometry, Records, Run, encode_run, normal_vectors
 from .spacing import node_spacings
 from .survey import NORMAL_BITS, Survey
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from .journal import Journal
     from .options import BuildOptions
     from .progress import Progress
-    from .scatter import Regions
+    from .rows import Rows
     from .work import Crew
 
 GENERATOR = "pointstream 0.1"
@@ -48,7 +48,6 @@ def publish(
     division: Division,
     found: Survey,
     inputs: Inputs,
-    regions: Regions,
     options: BuildOptions,
     *,
     folder: Folder,
@@ -62,8 +61,6 @@ def publish(
     ----------
     division, found, inputs
         The tree, what the survey found, and what is known of the scans.
-    regions : Regions
-        Rows sorted by node.
     options : BuildOptions
     folder : Folder
         Keeps the clouds until they are all there, and the journal of them.
@@ -79,7 +76,8 @@ def publish(
     """
     nodes = division.nodes
     extent = float((found.high - found.low).max())
-    step = choose_step(division.spacing, extent, options.position_error)
+    far = float(np.abs([found.low, found.high]).max())
+    step = choose_step(division.spacing, extent, options.position_error, far=far)
     geometry = Geometry.of(nodes, found.low, found.high, step)
     spacing, ratio = node_spacings(nodes, division.spacing, step)
     progress.stage("encode", int(nodes.subtree[0]))
@@ -87,10 +85,8 @@ def publish(
     path.touch()
     with path.open("r+b") as clouds:
         records = Records(nodes, geometry, spacing)
-        costs = _encode(records, clouds, folder.journal("encode"), regions, found, options.effort, crew, progress)
-        regions.close()
-        regions.path.unlink()  # its room is the model's
-        pages = -(-len(nodes) // options.page_nodes)
+        costs = _encode(records, clouds, folder.journal("encode"), division.rows, found, options.effort, crew, progress)
+        division.rows.remove()  # their room is the model's
         header = Header(
             bytes=2**53,
             samples=int(nodes.subtree[0]),
@@ -109,29 +105,31 @@ def publish(
             crs=inputs.crs,
             left_out={**inputs.left_out, **found.left_out},
             rejected=found.rejected,
-            bits_per_sample=bits_per_sample(
-                costs, clouds.tell(), PAGE_HEADER * pages + RECORD.itemsize * len(nodes), int(nodes.subtree[0])
-            ),
             spacing_ratio=ratio,
             seed=options.seed,
             generator=GENERATOR,
         )
         finished = records.finish()
-        header = seal(header, finished)
+        header = seal_with_costs(header, finished, costs, clouds.tell())
         progress.stage("write", header.samples)
         write_model(out, folder.part_of(out), header, finished, clouds)
     progress.advance(header.samples)
     return header
 
 
-def choose_step(spacing: float, extent: float, position_error: float | None) -> float:
+def choose_step(spacing: float, extent: float, position_error: float | None, *, far: float = 0.0) -> float:
     """Edge of a lattice cell.
+
+    Samples that all coincide are the lattice's origin, whatever its step: it is what float64 tells apart at the
+    largest coordinate, `far`.
 
     Raises
     ------
     BuildError
         If half the spacing as a bound takes more bits than a coordinate has, or the wanted error does.
     """
+    if position_error is None and extent == 0.0:
+        return EPSILON * (far or 1.0)
     step = position_step(spacing, extent, position_error)
     if position_error is None and spacing > 0 and step > SLACK * spacing:
         raise BuildError(
@@ -145,7 +143,7 @@ def _encode(
     records: Records,
     clouds: BinaryIO,
     journal: Journal,
-    regions: Regions,
+    regions: Rows,
     found: Survey,
     effort: Effort,
     crew: Crew,
@@ -155,12 +153,9 @@ def _encode(
     nodes, geometry = records.nodes, records.geometry
     has_normals = any(attribute.kind == "normal" for attribute in found.schema)
     table = normal_vectors(NORMAL_BITS) if has_normals else None
-
-    def one(run: tuple[int, int]) -> Run:
-        return encode_run(
-            *run, nodes=nodes, geometry=geometry, regions=regions, schema=found.schema, effort=effort, table=table
-        )
-
+    one = partial(
+        _encode_run, nodes=nodes, geometry=geometry, regions=regions, schema=found.schema, effort=effort, table=table
+    )
     costs = np.zeros(len(KINDS))
     costed = set(np.linspace(0, len(nodes) - 1, COSTED_CLOUDS).astype(int).tolist())
     waiting = runs(nodes, RUN_SAMPLES)
@@ -171,7 +166,7 @@ def _encode(
         clouds.seek(int(sizes.sum(dtype=np.int64)), os.SEEK_CUR)
         progress.advance(int(nodes.samples[first:stop].sum()))
     clouds.truncate()
-    for (first, stop), run in crew.map(one, waiting):
+    for (first, stop), run in crew.spread(one, waiting):
         clouds.writelines(run.frames)
         clouds.flush()
         records.add(run)
@@ -183,6 +178,10 @@ def _encode(
         journal.add(run.sizes, run.checks, run.reach, run.spread, part)
         progress.advance(int(nodes.samples[first:stop].sum()))
     return dict(zip(KINDS, costs.tolist(), strict=True))
+
+
+def _encode_run(run: tuple[int, int], **shared: Any) -> Run:
+    return encode_run(*run, **shared)
 
 
 def runs(nodes: Nodes, samples: int) -> list[tuple[int, int]]:

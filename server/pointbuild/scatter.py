@@ -7,6 +7,7 @@ counts of those before it, and a build that was killed can go on with the next. 
 from __future__ import annotations
 
 import os
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -89,16 +90,20 @@ class Regions:
         """Overwrite rows from number `row` on."""
         write_all(self._file, rows, row * self.dtype.itemsize)
 
-    def replace(self, row: int, rows: NDArray[Any]) -> None:
-        """Overwrite rows so that no sample is lost when the build is killed meanwhile; any thread may.
+    @contextmanager
+    def rewriting(self, row: int) -> Iterator[int]:
+        """Give a file for rows that are to stand from number `row` on; any thread may.
 
-        They are in a file of their own until `settle` is called or `restore` finds them.
+        It stays until `settle` is called or `restore` finds it: no sample is lost if the build is killed meanwhile.
         """
         part, whole = (self.path.with_name(f"{self.path.name}-{row}.{state}") for state in ("part", "whole"))
-        with part.open("wb") as file:
-            file.write(rows.reshape(-1).view(np.uint8).data)
-        part.rename(whole)
-        self.write(row, rows)
+        file = os.open(part, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+        try:
+            yield file
+            part.rename(whole)
+            self._copy(file, row * self.dtype.itemsize)
+        finally:
+            os.close(file)
 
     def settle(self, row: int) -> None:
         """Rows that were replaced will not be asked for again as they were."""
@@ -109,23 +114,40 @@ class Regions:
         for part in self.path.parent.glob(f"{self.path.name}-*.part"):
             part.unlink()
         for whole in self.path.parent.glob(f"{self.path.name}-*.whole"):
-            at = int(whole.stem.rpartition("-")[2]) * self.dtype.itemsize
-            with whole.open("rb") as file:
-                while piece := file.read(_PIECE):
-                    write_all(self._file, np.frombuffer(piece, np.uint8), at)
-                    at += len(piece)
+            file = os.open(whole, os.O_RDONLY)
+            self._copy(file, int(whole.stem.rpartition("-")[2]) * self.dtype.itemsize)
+            os.close(file)
             whole.unlink()
+
+    def _copy(self, file: int, offset: int) -> None:
+        at = 0
+        while piece := os.pread(file, _PIECE, at):
+            write_all(self._file, np.frombuffer(piece, np.uint8), offset + at)
+            at += len(piece)
 
     def read(self, row: int, out: NDArray[Any]) -> None:
         """Fill `out` with rows from number `row` on."""
         read_all(self._file, out, row * self.dtype.itemsize)
 
-    def chunks(self, bucket: int, rows: int) -> Iterator[NDArray[Any]]:
-        """Yield a bucket's rows in pieces of at most so many."""
-        for at in range(int(self.first[bucket]), int(self.first[bucket + 1]), rows):
-            out = np.empty(min(rows, int(self.first[bucket + 1]) - at), self.dtype)
+    def chunks(self, row: int, count: int, most: int) -> Iterator[NDArray[Any]]:
+        """Yield `count` rows from number `row` on, at most `most` at a time."""
+        for at in range(row, row + count, most):
+            out = np.empty(min(most, row + count - at), self.dtype)
             self.read(at, out)
             yield out
+
+    def replaced(self) -> Regions:
+        """Give the rows after every bucket was replaced: they are at the same place."""
+        return self
+
+    def clear(self) -> None:
+        """Give back the room of all rows."""
+        os.truncate(self._file, 0)
+
+    def remove(self) -> None:
+        """Remove the file."""
+        self.close()
+        self.path.unlink()
 
     def close(self) -> None:
         """Close the file; twice is fine."""
@@ -176,7 +198,7 @@ def gather(regions: Regions, limits: NDArray[np.uint64], chunk: int) -> Candidat
     """Candidates once more from the rows as they were scattered, `chunk` at a time: the limits were too low."""
     priority, bucket = [np.empty(0, np.uint64)], [np.empty(0, np.int32)]
     for number, limit in enumerate(limits):
-        for rows in regions.chunks(number, chunk):
+        for rows in regions.chunks(int(regions.first[number]), int(np.diff(regions.first)[number]), chunk):
             chosen = rows["priority"][rows["priority"] <= limit]
             priority.append(chosen)
             bucket.append(np.full(len(chosen), number, np.int32))

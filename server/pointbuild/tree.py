@@ -22,6 +22,11 @@ if TYPE_CHECKING:
 
     from .cells import Cells
 
+TOO_MANY = (
+    f"too many samples stand at one place for a tree of {MAX_LEVELS} levels of at most {COINCIDENT:,}: "
+    "remove the duplicates"
+)
+
 
 @dataclass(frozen=True, slots=True)
 class Tree:
@@ -101,10 +106,7 @@ def grow(
         depth, np.uint64(max(threshold, 0)), cloud_size, nodes, owner,
     )  # fmt: skip
     if count < 0:
-        raise BuildError(
-            f"too many samples stand at one place for a tree of {MAX_LEVELS} levels of at most {COINCIDENT:,}: "
-            "remove the duplicates"
-        )
+        raise BuildError(TOO_MANY)
     return Tree(*nodes[:, :count].copy()), owner
 
 

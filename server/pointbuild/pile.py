@@ -1,0 +1,153 @@
+"""A bucket of samples at one place, however many: no path tells them apart, so none is sorted in memory with all.
+
+Their tree is a chain of nodes that takes them by priority. So a pile is sorted by priority, in slices of priorities
+that fit into memory, and its clouds are cut off one after another. The result is that of `bucket.partition`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lpc.errors import BuildError
+from lpc.header_checks import MAX_LEVELS
+from lpc.page import COINCIDENT
+
+from .areas import Probing, pile_spacing
+from .bucket import BucketTree, Clouds, summarise
+from .spool import read_all, write_all
+from .tree import TOO_MANY, Tree
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from .cells import Cells
+    from .plan import Bucket
+    from .rows import Rows
+
+SLICE_BITS = 16
+"""Priorities with the same first bits stay in one slice; hashes, they are few."""
+
+CHUNK = 1 << 14
+"""Rows looked at together where a few arrays of them are made."""
+
+
+def check_piles(buckets: Sequence[Bucket]) -> None:
+    """Raise BuildError if more samples coincide than a chain of nodes can hold."""
+    if any(bucket.coincident and bucket.count > COINCIDENT * MAX_LEVELS for bucket in buckets):
+        raise BuildError(TOO_MANY)
+
+
+def partition_pile(
+    first_row: int,
+    bucket: Bucket,
+    above: list[int],
+    thresholds: list[int],
+    *,
+    most: int,
+    cells: Cells,
+    probing: Probing,
+    cloud_size: int,
+    regions: Rows,
+    normals: NDArray[np.int32] | None,
+) -> BucketTree:
+    """Sort a pile's rows by node, on disk.
+
+    Parameters
+    ----------
+    most : int
+        Rows to hold in memory.
+    first_row, bucket, above, thresholds, cells, probing, cloud_size, regions, normals
+        As for `bucket.partition`.
+
+    Raises
+    ------
+    BuildError
+        If more samples coincide than a chain of nodes can hold.
+    """
+    taken = _sort_by_priority(first_row, bucket.count, thresholds, most, regions)
+    left = bucket.count - int(taken.sum())
+    first = cells.fixed(next(regions.chunks(first_row, 1, 1))["xyz"])
+    tree = _chain(bucket, left, cloud_size, cells, first[0])
+    counts = np.concatenate([taken, tree.samples])
+    clouds, at = [], first_row
+    for count in counts.tolist():
+        rows = np.empty(count, regions.dtype)
+        regions.read(at, rows)
+        part = summarise(rows, np.zeros(1, np.int64), np.array([count]), normals)
+        part.first[:] += at
+        clouds.append(part.arrays())
+        at += count
+    whole = Clouds(*(np.concatenate(parts) for parts in zip(*clouds, strict=True)))
+    used = np.flatnonzero(taken)
+    (face,) = cells.faces(first, np.array([bucket.depth]))
+    asked = next(regions.chunks(first_row, min(bucket.count, probing.region), probing.region))
+    xyz, priority = np.ascontiguousarray(asked["xyz"]), np.ascontiguousarray(asked["priority"])
+    spacing = pile_spacing(xyz, priority, face, probing, bucket.count)
+    measured = [spacing] if spacing > 0 else []
+    area = spacing**2 * bucket.count
+    return BucketTree(
+        tree=tree,
+        clouds=whole.part(slice(len(taken), None)),
+        upper=np.array(above, np.int64)[used],
+        fragments=whole.part(used),
+        area=np.full(len(tree), area * bucket.count / bucket.count),
+        cell_area=area,
+        spacing=np.array(measured),
+        weight=np.full(len(measured), bucket.count),
+    )
+
+
+def _sort_by_priority(first_row: int, count: int, thresholds: list[int], most: int, regions: Rows) -> NDArray[np.int64]:
+    """Sort the rows; how many each of the nodes above takes."""
+    limits = np.array(thresholds, np.uint64)
+    shift = np.uint64(64 - SLICE_BITS)
+    histogram = np.zeros(1 << SLICE_BITS, np.int64)
+    taken = np.zeros(len(limits) + 1, np.int64)
+    for rows in regions.chunks(first_row, count, CHUNK):
+        histogram += np.bincount((rows["priority"] >> shift).astype(np.int64), minlength=len(histogram))
+        taken += np.bincount(np.searchsorted(limits, rows["priority"]), minlength=len(taken))
+    slice_of = np.maximum(np.cumsum(histogram) - 1, 0) // most
+    sizes = np.bincount(slice_of, histogram).astype(np.int64)
+    starts = np.cumsum(sizes) - sizes
+    filled = starts.copy()
+    size = regions.dtype.itemsize
+    with regions.rewriting(first_row) as file:
+        for rows in regions.chunks(first_row, count, CHUNK):
+            number = slice_of[(rows["priority"] >> shift).astype(np.int64)]
+            for each in np.unique(number):
+                part = rows[number == each]
+                write_all(file, part, int(filled[each]) * size)
+                filled[each] += len(part)
+        for start, length in zip(starts.tolist(), sizes.tolist(), strict=True):
+            rows = np.empty(length, regions.dtype)
+            read_all(file, rows, start * size)
+            write_all(file, rows[np.argsort(rows["priority"])], start * size)
+    return taken[:-1]
+
+
+def _chain(bucket: Bucket, left: int, cloud_size: int, cells: Cells, fixed: NDArray[np.uint64]) -> Tree:
+    """Nodes for `left` samples, one below the other."""
+    full = max(cloud_size, COINCIDENT)
+    nodes = -(-left // full)
+    if bucket.depth + nodes > MAX_LEVELS:
+        raise BuildError(TOO_MANY)
+    depth = bucket.depth + np.arange(nodes)
+    half = np.zeros(nodes, np.int64)
+    for node in range(1, nodes):
+        split = bucket.depth + node - 1
+        if split < cells.depths:
+            half[node] = int(fixed[cells.axes[split]] >> np.uint64(cells.shifts[split])) & 1
+    subtree = left - full * np.arange(nodes)
+    return Tree(
+        parent=np.arange(nodes) - 1,
+        half=half,
+        depth=depth,
+        low=np.zeros(nodes, np.int64),
+        high=np.full(nodes, bucket.count),
+        subtree=subtree,
+        samples=np.minimum(subtree, full),
+    )
