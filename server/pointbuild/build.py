@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 
     from lpc.header import Header
 
+    from .cluster import Cluster
     from .readers import Scan
 
 
@@ -80,6 +81,7 @@ def build_model(
     *,
     clock: Callable[[], float],
     tell: Callable[[str], None] = lambda _: None,
+    cluster: Cluster | None = None,
 ) -> BuildReport:
     """Build one model of some scans.
 
@@ -95,6 +97,8 @@ def build_model(
         Seconds, monotonic.
     tell : callable
         Gets a sentence where a build that was killed left files.
+    cluster : Cluster, optional
+        Workers that sort and encode; without them threads do.
 
     Raises
     ------
@@ -108,10 +112,12 @@ def build_model(
     disk.check_target(out)
     progress = progress or Silent()
     manifest = manifest_of(sources, options, GENERATOR)
+    if manifest and cluster:
+        manifest["cluster"] = cluster.url
     with disk.translated(out), work_folder(options.scratch or out.parent, out, manifest, tell) as folder:
         if not kernels_are_loaded():
             _warm(folder)
-        header = _build(sources, out, folder, options, progress)
+        header = _build(sources, out, folder, options, progress, cluster)
     return BuildReport(header=header, seconds=clock() - began, peak_rss_bytes=memory.peak_bytes())
 
 
@@ -127,7 +133,14 @@ def _warm(folder: Folder) -> None:
     folder.remove("warm")
 
 
-def _build(sources: Sequence[Source], out: Path, folder: Folder, options: BuildOptions, progress: Progress) -> Header:
+def _build(
+    sources: Sequence[Source],
+    out: Path,
+    folder: Folder,
+    options: BuildOptions,
+    progress: Progress,
+    cluster: Cluster | None = None,
+) -> Header:
     """Go through the stages; what the folder's journals know is not done again."""
     journal = folder.journal("survey")
     recalled = next(iter(journal), None)
@@ -143,7 +156,7 @@ def _build(sources: Sequence[Source], out: Path, folder: Folder, options: BuildO
     with (
         closing(Spool(folder.path / "spool", columns_of(inputs.attributes), blocks)) as spool,
         closing(Regions(folder.path / "rows")) as regions,
-        Crew(sizes.threads) as crew,
+        cluster.crew(sizes.threads, folder) if cluster else Crew(sizes.threads) as crew,
     ):
         progress.stage("read", spool.samples or inputs.samples_hint)
         if recalled is None:
@@ -166,7 +179,7 @@ def _build(sources: Sequence[Source], out: Path, folder: Folder, options: BuildO
             crew=crew,
             progress=progress,
         )
-        return publish(division, found, inputs, regions, options, folder=folder, out=out, crew=crew, progress=progress)
+        return publish(division, found, inputs, options, folder=folder, out=out, crew=crew, progress=progress)
 
 
 def _estimate(scan: Scan, *, scratch: Path, options: BuildOptions) -> Scan:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
 from typing import TYPE_CHECKING, Self, TypeVar
 
 if TYPE_CHECKING:
@@ -49,7 +48,7 @@ class Crew:
         One item more than there are threads is under way or waiting to be yielded, which is what bounds the memory.
         When the caller stops or a call fails, what has not begun is cancelled and what has is waited for.
         """
-        return in_order(partial(self._pool.submit, function), items, self.threads)
+        return in_order(lambda item: self._pool.submit(function, item), items, self.threads)
 
     def share(self, regions: Regions, folder: Folder) -> Rows:  # noqa: ARG002, others need the folder
         """Take the scattered rows where all that `spread` runs can reach them: they are there already."""
