@@ -24,7 +24,10 @@ from .sizes import parse_size
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from contextlib import AbstractContextManager
     from types import FrameType
+
+    from .cluster import Cluster
 
 
 @click.command()
@@ -46,6 +49,9 @@ if TYPE_CHECKING:
 @click.option("--effort", default="default", show_default=True, type=click.Choice(["fast", "default", "best"]),
               help="What packing may cost.")  # fmt: skip
 @click.option("--scratch", default=None, type=click.Path(path_type=Path), help="Directory for temporary files.")
+@click.option("--dask", default=None, metavar="ADDRESS", help="Scheduler whose workers sort and encode.")
+@click.option("--share", default=None, metavar="URL",
+              help="What all workers reach, a folder or s3://...; default: that of --scratch.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
 def build(
     scans: tuple[Path, ...],
@@ -54,6 +60,8 @@ def build(
     position_error: str,
     attributes: str | None,
     as_json: bool,
+    dask: str | None,
+    share: str | None,
     **options: Any,
 ) -> None:
     """Turn scans (PLY, LAS, LAZ, E57, PCD, OBJ, NPZ, text) into one model."""
@@ -65,8 +73,10 @@ def build(
         else tuple(name.strip() for name in attributes.split(",") if name.strip()),
         **options,
     )
-    with _stopped_by_signals(), _progress(as_json) as progress:
-        report = build_model(scans, out, chosen, progress, clock=time.monotonic)
+    if share is not None and dask is None:
+        raise click.BadParameter("only a build on a cluster (--dask) shares files", param_hint="--share")
+    with _stopped_by_signals(), _progress(as_json) as progress, _cluster(dask, share) as cluster:
+        report = build_model(scans, out, chosen, progress, clock=time.monotonic, cluster=cluster)
     if as_json:
         click.echo(json.dumps(report_dict(report)))
     else:
@@ -110,6 +120,14 @@ def _length(text: str) -> float | None:
     if not (math.isfinite(length) and length > 0):
         raise click.BadParameter(f"{text!r} is neither auto nor a length above 0", param_hint="--position-error")
     return length
+
+
+def _cluster(address: str | None, url: str | None) -> AbstractContextManager[Cluster | None]:
+    if address is None:
+        return nullcontext()
+    from .cluster import dask_cluster  # slow to import
+
+    return dask_cluster(address, url)
 
 
 def _progress(quiet: bool) -> Any:

@@ -1,0 +1,167 @@
+"""Rows of buckets where several machines reach them: whole files that are written once and never changed.
+
+That is what a folder on shared disks and a store of the S3 kind have in common. A bucket's rows are put there as they
+were scattered; whoever sorts them puts them beside as another file. So a worker may die at any moment, and two may
+do the same work.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import uuid
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+
+from lpc.errors import BuildError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from fsspec import AbstractFileSystem
+    from numpy.typing import NDArray
+
+    from .scatter import Regions
+
+_PIECE = 1 << 16  # rows, or bytes, copied at a time
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """A folder of files by name.
+
+    Parameters
+    ----------
+    url : str
+        A path that is the same on all machines, or an fsspec address such as ``s3://bucket/folder``.
+    """
+
+    url: str
+
+    def put(self, name: str, source: BinaryIO) -> None:
+        """Copy a file from its start; nobody ever sees half of the copy."""
+        files, root = self._files()
+        # A store shows a file when it is complete; a folder would show it before.
+        part = f"{name}.{uuid.uuid4().hex}" if _is_folder(files) else name
+        source.seek(0)
+        try:
+            with files.open(f"{root}/{part}", "wb") as target:
+                shutil.copyfileobj(source, target, _PIECE)
+            if part != name:
+                Path(root, part).replace(Path(root, name))
+        except OSError as error:
+            raise BuildError(f"{self.url} cannot be written to: {error}") from error
+
+    def get(self, name: str, start: int | None = None, stop: int | None = None) -> bytes:
+        """Bytes `start` to `stop` of a file."""
+        files, root = self._files()
+        try:
+            found: bytes = files.cat_file(f"{root}/{name}", start, stop)
+        except OSError as error:
+            raise BuildError(
+                f"{self.url} does not hold {name}, or a worker does not reach it: name a folder or a store that all "
+                f"machines share ({error})"
+            ) from error
+        return found
+
+    def remove(self, name: str) -> None:
+        """Remove a file that is there."""
+        files, root = self._files()
+        files.rm_file(f"{root}/{name}")
+
+    def make(self) -> None:
+        """Make the folder."""
+        files, root = self._files()
+        try:
+            files.makedirs(root, exist_ok=True)
+        except OSError as error:
+            raise BuildError(f"{self.url} cannot be made: {error}") from error
+
+    def clear(self) -> None:
+        """Remove everything, the folder too."""
+        files, root = self._files()
+        if files.exists(root):
+            files.rm(root, recursive=True)
+
+    def _files(self) -> tuple[AbstractFileSystem, str]:
+        from fsspec.core import url_to_fs  # part of the extra "cluster"
+
+        try:
+            files, root = url_to_fs(self.url)
+        except (ImportError, ValueError) as error:
+            raise BuildError(f"{self.url}: {error}") from error
+        return files, str(root)
+
+
+def _is_folder(files: AbstractFileSystem) -> bool:
+    return "file" in ((files.protocol,) if isinstance(files.protocol, str) else files.protocol)
+
+
+class SharedRegions:
+    """`Regions` whose buckets are files of a share; it may be sent to other processes.
+
+    Parameters
+    ----------
+    share : Share
+    dtype : dtype
+        Of a row.
+    first : ndarray, (buckets + 1,) int64
+        Where each bucket's rows begin.
+    kind : str
+        Which of a bucket's files `read` reads: as they were ``scattered`` or ``sorted``.
+    """
+
+    def __init__(self, share: Share, dtype: np.dtype[Any], first: NDArray[np.int64], kind: str = "scattered") -> None:
+        self.share, self.dtype, self.first, self._kind = share, dtype, first, kind
+
+    def take(self, regions: Regions) -> None:
+        """Copy all rows as they were scattered."""
+        for bucket, (first, stop) in enumerate(zip(regions.first[:-1], regions.first[1:], strict=True)):
+            with tempfile.TemporaryFile() as file:
+                for rows in regions.chunks(int(first), int(stop - first), _PIECE):
+                    file.write(rows.view(np.uint8).data)
+                self.share.put(f"scattered-{bucket}", file)
+
+    def replaced(self) -> SharedRegions:
+        """Give the rows after every bucket was replaced."""
+        return SharedRegions(self.share, self.dtype, self.first, "sorted")
+
+    def remove(self) -> None:
+        """Remove all files of the share."""
+        self.share.clear()
+
+    def read(self, row: int, out: NDArray[Any]) -> None:
+        """Fill `out` with rows from number `row` on, all of one bucket."""
+        if not len(out):
+            return
+        bucket = self._bucket(row)
+        start = (row - int(self.first[bucket])) * self.dtype.itemsize
+        data = self.share.get(f"{self._kind}-{bucket}", start, start + out.nbytes)
+        if len(data) != out.nbytes:
+            raise BuildError(f"{self.share.url} holds fewer rows than it did: is another program cleaning up?")
+        out[:] = np.frombuffer(data, self.dtype)
+
+    def chunks(self, row: int, count: int, most: int) -> Iterator[NDArray[Any]]:
+        """Yield `count` rows from number `row` on, at most `most` at a time."""
+        for at in range(row, row + count, most):
+            out = np.empty(min(most, row + count - at), self.dtype)
+            self.read(at, out)
+            yield out
+
+    @contextmanager
+    def rewriting(self, row: int) -> Iterator[int]:
+        """Give a file for the sorted rows of the bucket that begins at number `row`."""
+        with tempfile.TemporaryFile() as file:
+            yield file.fileno()
+            self.share.put(f"sorted-{self._bucket(row)}", file)
+
+    def settle(self, row: int) -> None:
+        """Remove the rows as they were scattered."""
+        self.share.remove(f"scattered-{self._bucket(row)}")
+
+    def _bucket(self, row: int) -> int:
+        return int(np.searchsorted(self.first, row, side="right")) - 1

@@ -1,0 +1,189 @@
+"""A build on a cluster gives the bytes of a build on one machine, whoever dies meanwhile."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import fsspec
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from distributed import Client
+from oracles import surfaces
+
+from lpc.errors import BuildError
+from lpc.points import PointBatch
+from pointbuild import BuildOptions, build_model, cluster
+from pointbuild.arrays import ArrayScan
+from pointbuild.cli import build
+from pointbuild.cluster import Cluster, dask_cluster, perform, versions
+from pointbuild.progress import Silent
+from pointbuild.share import Share
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+ROOT = Path(__file__).resolve().parents[2]
+OPTIONS = BuildOptions(cloud_size=128, threads=1, bucket_samples=700, block_samples=2000)
+
+
+class Killing(Silent):
+    """Calls a function when a stage has got somewhere."""
+
+    def __init__(self, stage: str, kill: Callable[[], None]) -> None:
+        self._stage, self._kill, self._now = stage, kill, ""
+
+    def stage(self, name: str, total: int | None) -> None:
+        self._now = name
+
+    def advance(self, samples: int) -> None:
+        if self._now == self._stage:
+            self._now = ""
+            self._kill()
+
+
+@pytest.fixture(scope="module")
+def points() -> PointBatch:
+    dense = surfaces.bumpy(9000, seed=1, color=True)
+    pile = PointBatch.concatenate([dense.take(slice(5, 6))] * 900)
+    return PointBatch.concatenate([dense, pile])
+
+
+@pytest.fixture(scope="module")
+def reference(points: PointBatch, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    return made(points, tmp_path_factory.mktemp("m") / "m.lpc", None)
+
+
+def made(points: PointBatch, out: Path, workers: Cluster | None, progress: Any = None) -> bytes:
+    build_model([ArrayScan(points)], out, OPTIONS, progress, clock=time.monotonic, cluster=workers)
+    return out.read_bytes()
+
+
+@pytest.mark.parametrize("url", [None, "memory://share", "file"])
+def test_any_executor_and_share_give_the_same_bytes(
+    url: str | None, points: PointBatch, reference: bytes, tmp_path: Path
+) -> None:
+    # fsspec's memory has what S3 has: whole objects by name, ranges of them, no folders, no renaming.
+    folder = tmp_path / "shared"
+    folder.mkdir()
+    with ThreadPoolExecutor(2) as executor:
+        workers = Cluster(executor, 4, f"file://{folder}" if url == "file" else url)
+        assert made(points, tmp_path / "m.lpc", workers) == reference
+    assert not fsspec.filesystem("memory").find("/share")
+    assert not list(folder.iterdir())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["m.lpc", "shared"]
+
+
+def test_a_failed_build_leaves_nothing_in_the_share(points: PointBatch, tmp_path: Path) -> None:
+    folder = tmp_path / "shared"
+    folder.mkdir()
+
+    def fail() -> None:
+        assert list(folder.rglob("sorted-*"))
+        raise KeyboardInterrupt
+
+    with ThreadPoolExecutor(1) as executor, pytest.raises(KeyboardInterrupt):
+        made(points, tmp_path / "m.lpc", Cluster(executor, 2, str(folder)), Killing("encode", fail))
+    assert not list(folder.iterdir())
+    assert [path.name for path in tmp_path.iterdir()] == ["shared"]
+
+
+def test_shares_of_two_builds_do_not_mix(points: PointBatch, reference: bytes, tmp_path: Path) -> None:
+    other = PointBatch.concatenate([points, points.take(slice(0, 3000))])
+    plain = made(other, tmp_path / "plain.lpc", None)
+    with ThreadPoolExecutor(2) as executor, ThreadPoolExecutor(2) as builds:
+        workers = Cluster(executor, 4, "memory://both")
+        first = builds.submit(made, points, tmp_path / "1.lpc", workers)
+        second = builds.submit(made, other, tmp_path / "2.lpc", workers)
+        assert first.result() == reference
+        assert second.result() == plain
+
+
+def test_workers_of_other_versions_refuse(tmp_path: Path) -> None:
+    with pytest.raises(BuildError, match=r"zstd 0\.0\.1.*install the same versions"):
+        perform(Share(str(tmp_path)), "task", (*versions()[:-1], "zstd 0.0.1"), 0)
+
+
+def test_workers_that_do_not_reach_the_share_say_so(tmp_path: Path) -> None:
+    with pytest.raises(BuildError, match="name a folder or a store that all machines share"):
+        perform(Share(str(tmp_path / "elsewhere")), "task", versions(), 0)
+
+
+def test_a_share_of_an_unknown_kind_is_one_sentence(points: PointBatch, tmp_path: Path) -> None:
+    with ThreadPoolExecutor(1) as executor, pytest.raises(BuildError, match="nosuchstore"):
+        made(points, tmp_path / "m.lpc", Cluster(executor, 2, "nosuchstore://bucket"))
+
+
+def test_the_command_says_when_no_scheduler_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "WAIT", 0.5)
+    scan = tmp_path / "a.xyz"
+    np.savetxt(scan, np.random.default_rng(0).random((50, 3)))
+    arguments = [str(scan), "-o", str(tmp_path / "m.lpc")]
+    found = CliRunner().invoke(build, [*arguments, "--dask", "tcp://127.0.0.1:9"])
+    assert isinstance(found.exception, BuildError)
+    assert str(found.exception).startswith("no Dask scheduler answers at tcp://127.0.0.1:9")
+    assert CliRunner().invoke(build, [*arguments, "--share", "x"]).exit_code == 2
+
+
+class Dask:
+    """A scheduler and two workers of one thread, each a process."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        self._stack = stack
+        self._file = folder / "scheduler.json"
+        options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(self._file)]
+        self._start("dask_scheduler", *options)
+        while not (self._file.exists() and self._file.read_text().endswith("}")):
+            time.sleep(0.02)
+        self.workers = [self._worker(folder / str(number)) for number in range(2)]
+        with Client(self.address, set_as_default=False) as client:
+            client.wait_for_workers(2)
+
+    @property
+    def address(self) -> str:
+        return str(json.loads(self._file.read_text())["address"])
+
+    def _worker(self, folder: Path) -> subprocess.Popen[bytes]:
+        options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--memory-limit", "0"]
+        options += ["--local-directory", str(folder), "--scheduler-file", str(self._file)]
+        return self._start("dask_worker", *options)
+
+    def _start(self, program: str, *options: str) -> subprocess.Popen[bytes]:
+        path = os.pathsep.join(str(ROOT / room) for room in ("common", "server", "client"))
+        process = subprocess.Popen(
+            [sys.executable, "-m", f"distributed.cli.{program}", *options],
+            env={**os.environ, "PYTHONPATH": path},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        self._stack.callback(process.wait)
+        self._stack.callback(process.kill)
+        return process
+
+
+@pytest.fixture
+def dask(tmp_path: Path) -> Iterator[Dask]:
+    folder = tmp_path / "dask"
+    folder.mkdir()
+    with ExitStack() as stack:
+        yield Dask(folder, stack)
+
+
+@pytest.mark.parametrize("stage", ["partition", "encode"])
+def test_a_worker_killed_in_the_middle_leaves_no_trace(
+    stage: str, points: PointBatch, reference: bytes, dask: Dask, tmp_path: Path
+) -> None:
+    with dask_cluster(dask.address, None) as workers:
+        killing = Killing(stage, dask.workers[0].kill)
+        assert made(points, tmp_path / "m.lpc", workers, killing) == reference
+    assert dask.workers[0].wait() == -9
+    assert dask.workers[1].poll() is None
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["dask", "m.lpc"]
