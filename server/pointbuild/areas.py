@@ -4,8 +4,8 @@ The spacing of a region is sqrt(pi / 8) times the median distance to the eighth 
 eight samples of area r^2 each. (The mean distance to the *nearest* neighbour is about half of it.) Regions are cells
 of at most 2 M samples. What a region holds does not depend on buckets or thresholds, so neither does the result.
 
-Two kinds of regions have no area to speak of. Along a straight line the eight neighbours lie on both sides, so the spacing
-is a quarter of the distance. A model of fewer than `FEWEST` samples has the smallest distance of any two of them: half
+Two kinds of regions have no area to speak of. Along a straight line the eight neighbours lie on both sides, so the
+spacing is a quarter of the distance. A model of fewer than `FEWEST` samples has the smallest distance of any two: half
 of it, the position error, then keeps them apart.
 
 Surface adds up: an inner cell has the area of its halves. A cell of few samples takes the density of its sibling.
