@@ -30,7 +30,7 @@ from .cells import Cells
 from .divide import divide
 from .encode import kernels_are_loaded
 from .folder import Folder, manifest_of, work_folder
-from .inputs import Inputs, Source, open_inputs
+from .inputs import Inputs, Source, expand, open_inputs
 from .journal import as_array, from_array
 from .options import BuildOptions
 from .progress import Progress, Silent
@@ -96,7 +96,7 @@ def build_model(
     clock : callable
         Seconds, monotonic.
     tell : callable
-        Gets a sentence where a build that was killed left files.
+        Gets a sentence where a build that was killed left files, and where the scans differ.
     cluster : Cluster, optional
         Workers that sort and encode; without them threads do.
 
@@ -111,13 +111,14 @@ def build_model(
     out = Path(out)
     disk.check_target(out)
     progress = progress or Silent()
+    sources = expand(sources)
     manifest = manifest_of(sources, options, GENERATOR)
     if manifest and cluster:
         manifest["cluster"] = cluster.url
     with disk.translated(out), work_folder(options.scratch or out.parent, out, manifest, tell) as folder:
         if not kernels_are_loaded():
             _warm(folder)
-        header = _build(sources, out, folder, options, progress, cluster)
+        header = _build(sources, out, folder, options, progress, cluster, tell)
     return BuildReport(header=header, seconds=clock() - began, peak_rss_bytes=memory.peak_bytes())
 
 
@@ -140,6 +141,7 @@ def _build(
     options: BuildOptions,
     progress: Progress,
     cluster: Cluster | None = None,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> Header:
     """Go through the stages; what the folder's journals know is not done again."""
     journal = folder.journal("survey")
@@ -147,6 +149,8 @@ def _build(
     if recalled is None:
         folder.remove("normals-*")
         inputs = open_inputs(sources, options, partial(_estimate, scratch=folder.path, options=options))
+        for note in inputs.notes:
+            tell(note)
         sizes, blocks = _sizes(inputs, out, folder, options), None
     else:
         told = from_array(recalled[0])

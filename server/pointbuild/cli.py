@@ -64,7 +64,7 @@ def build(
     share: str | None,
     **options: Any,
 ) -> None:
-    """Turn scans (PLY, LAS, LAZ, E57, PCD, OBJ, NPZ, text) into one model."""
+    """Turn scans (PLY, LAS, LAZ, E57, PCD, OBJ, NPZ, text), or directories of them, into one model."""
     chosen = BuildOptions(
         memory_bytes=_size(memory),
         position_error=_length(position_error),
@@ -76,11 +76,15 @@ def build(
     if share is not None and dask is None:
         raise click.BadParameter("only a build on a cluster (--dask) shares files", param_hint="--share")
     with _stopped_by_signals(), _progress(as_json) as progress, _cluster(dask, share) as cluster:
-        report = build_model(scans, out, chosen, progress, clock=time.monotonic, cluster=cluster)
+        report = build_model(scans, out, chosen, progress, clock=time.monotonic, tell=_tell, cluster=cluster)
     if as_json:
         click.echo(json.dumps(report_dict(report)))
     else:
         click.echo(_sentence(report, out))
+
+
+def _tell(text: str) -> None:
+    click.echo(text, err=True)
 
 
 def report_dict(report: BuildReport) -> dict[str, Any]:

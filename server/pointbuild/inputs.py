@@ -13,6 +13,7 @@ from lpc.errors import BuildError
 from lpc.points import PointBatch
 
 from .readers import Scan, open_scan
+from .readers.detect import SUFFIXES
 from .readers.scan import DEFAULT_ATTRIBUTES
 
 if TYPE_CHECKING:
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from .options import BuildOptions
 
 Source = Scan | Path | str
+
+MOST_SCALES = 4
+"""Named in a note."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +39,15 @@ class Inputs:
     left_out : dict of str to str
         What some scan has and the model will not have, and why.
     crs : str or None
+    notes : tuple of str
+        How the scans differ and what became of it, a sentence each.
     """
 
     scans: tuple[Scan, ...]
     attributes: dict[str, np.dtype[Any]]
     left_out: dict[str, str]
     crs: str | None
+    notes: tuple[str, ...] = ()
 
     @property
     def samples_hint(self) -> int | None:
@@ -73,6 +80,27 @@ class Inputs:
         for scan in self.scans:
             for batch in scan.batches(size):
                 yield PointBatch(batch.xyz, {name: batch.attributes[name] for name in self.attributes})
+
+
+def expand(sources: Sequence[Source]) -> list[Source]:
+    """Put the scan files of a directory, in the order of their names, in its place.
+
+    Raises
+    ------
+    BuildError
+        If a directory holds none.
+    """
+    found: list[Source] = []
+    for source in sources:
+        if not isinstance(source, str | Path) or not Path(source).is_dir():
+            found.append(source)
+            continue
+        files = sorted(Path(source).iterdir(), key=lambda path: path.name)
+        scans = [path for path in files if path.suffix.lower() in SUFFIXES and path.name[0] != "." and path.is_file()]
+        if not scans:
+            raise BuildError(f"the directory {source} holds no scan; name one that does, or files")
+        found.extend(scans)
+    return found
 
 
 def open_inputs(
@@ -109,14 +137,19 @@ def open_inputs(
     first = scans[0].info
     for scan in scans[1:]:
         if scan.info.crs != first.crs:
+            with_one = [path for path, crs in ((first.path, first.crs), (scan.info.path, scan.info.crs)) if crs]
+            why = (
+                f"only {with_one[0]} of them says which one it has" if len(with_one) == 1 else "they say different ones"
+            )
             raise BuildError(
-                f"{first.path} and {scan.info.path} have different coordinate systems: "
+                f"{first.path} and {scan.info.path} have different coordinate systems ({why}): "
                 "bring them into one, then build them together"
             )
     left_out: dict[str, str] = {}
     for scan in scans:
         left_out.update(scan.info.left_out)
     attributes = _common(scans, left_out)
+    notes = tuple(_differences(scans, left_out))
     if wanted is not None and "all" not in wanted:
         absent = sorted(set(wanted) - set(attributes) - set(left_out))
         if absent:
@@ -129,7 +162,21 @@ def open_inputs(
     attributes = {name: dtype for name, dtype in attributes.items() if name not in left_out}
     if len(attributes) > MAX_ATTRIBUTES:
         raise BuildError(f"{len(attributes)} attributes are too many: name at most {MAX_ATTRIBUTES} with --attributes")
-    return Inputs(scans, attributes, left_out, first.crs)
+    return Inputs(scans, attributes, left_out, first.crs, notes)
+
+
+def _differences(scans: tuple[Scan, ...], left_out: dict[str, str]) -> Iterator[str]:
+    """Say how scans differ: nothing is merged in silence."""
+    if len(scans) == 1:
+        return
+    some = {name for scan in scans for name in scan.info.attributes}
+    for name in sorted(some & left_out.keys()):
+        yield f"{name} is left out: {left_out[name]}"
+    scales = {scan.info.scale: scan.info.path.name for scan in reversed(scans) if scan.info.scale is not None}
+    if len(scales) > 1:
+        shown = list(scales.items())[:MOST_SCALES]
+        named = ", ".join(f"{'/'.join(f'{part:g}' for part in scale)} in {name}" for scale, name in shown)
+        yield f"the scans state positions at {len(scales)} scales, and each keeps its own: {named}"
 
 
 def _common(scans: tuple[Scan, ...], left_out: dict[str, str]) -> dict[str, np.dtype[Any]]:
@@ -138,9 +185,10 @@ def _common(scans: tuple[Scan, ...], left_out: dict[str, str]) -> dict[str, np.d
     common = {}
     for name in names:
         dtypes = [scan.info.attributes[name] for scan in scans if name in scan.info.attributes]
-        if len(dtypes) < len(scans):
-            where = next(scan.info.path.name for scan in scans if name not in scan.info.attributes)
-            left_out[name] = f"{where} has none"
+        without = [scan.info.path.name for scan in scans if name not in scan.info.attributes]
+        if without:
+            more = f" and {len(without) - 1} more" if len(without) > 1 else ""
+            left_out[name] = f"missing in {without[0]}{more} of {len(scans)} scans"
         elif len(set(dtypes)) > 1:
             left_out[name] = f"its type differs between the scans ({dtypes[0]} and others)"
         else:

@@ -155,7 +155,7 @@ def test_scans_keep_what_all_have(tmp_path: Path) -> None:
                  color=RNG.integers(0, 255, (50, 3)).astype(np.uint8))  # fmt: skip
     header = header_of([first, second, third], tmp_path / "m.lpc")
     assert [entry.name for entry in header.attributes] == ["classification"]
-    assert header.left_out["color"] == "a has none"
+    assert header.left_out["color"] == "missing in a and 1 more of 3 scans"
     assert "type differs" in header.left_out["intensity"]
     assert header.samples == 150
 

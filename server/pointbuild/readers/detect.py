@@ -21,7 +21,7 @@ _KINDS = {
     "OBJ": (".obj",),
     "text": (".xyz", ".pts", ".csv", ".txt", ".asc", ".xyzrgb", ".xyzn"),
 }
-_SUFFIXES = {suffix: kind for kind, suffixes in _KINDS.items() for suffix in suffixes}
+SUFFIXES = {suffix: kind for kind, suffixes in _KINDS.items() for suffix in suffixes}
 _HEAD = 1 << 12
 
 
@@ -69,7 +69,7 @@ def detect(path: Path) -> str:
     if not head:
         raise ScanError(f"{path}: is empty; there is nothing to build")
     by_content = _kind_of(head)
-    by_suffix = _SUFFIXES.get(path.suffix.lower())
+    by_suffix = SUFFIXES.get(path.suffix.lower())
     if by_content is None and by_suffix in ("OBJ", "text") and b"\0" not in head:
         return by_suffix
     if by_content is not None:

@@ -82,6 +82,7 @@ class LasScan:
             attributes=attributes,
             raw_bytes=path.stat().st_size,
             left_out=left_out,
+            scale=tuple(map(float, header.scales)),
         )
 
     def batches(self, size: int) -> Iterator[PointBatch]:
