@@ -7,6 +7,7 @@ import json
 import math
 import os
 import re
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -16,10 +17,15 @@ from lpc.errors import FormatError
 from pointstream.cli import CACHE, choose_cache
 
 if TYPE_CHECKING:
+    from lpc.header import Header
+    from pointstream.cache import Cache
+
     from .refine import Cut
+    from .still import StillOptions
 
 LARGEST_SIDE = 16384
 MOST_THREADS = 8
+MOST_PICTURES = 100_000
 
 
 class SizeType(click.ParamType[tuple[int, int]]):
@@ -89,6 +95,23 @@ def positive(_ctx: click.Context, _param: click.Parameter, value: float) -> floa
 @click.option("--budget", type=click.IntRange(min=1), help="Most splats; coarser where the tolerance needs more.")
 @click.option("--backend", type=click.Choice(["auto", "gl", "cpu"]), default="auto", show_default=True)
 @click.option("--two-sided", is_flag=True, help="Show surfaces from behind too: for normals that may point inward.")
+@click.option("--path", type=click.Path(path_type=Path, dir_okay=False), help="PATH.json: a picture at each time.")
+@click.option("--turntable", type=click.IntRange(min=2, max=MOST_PICTURES), help="So many pictures around the model.")
+@click.option(
+    "--fps",
+    type=click.FloatRange(min=0.1, max=120),
+    callback=positive,
+    default=12.0,
+    show_default=True,
+    help="Pictures a second, of a path or turntable.",
+)
+@click.option(
+    "--animation",
+    type=click.Choice(["auto", "none", "mp4", "webp", "apng", "gif"]),
+    default="auto",
+    show_default=True,
+    help="Format of the animated file beside the numbered pictures.",
+)
 @CACHE
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def render(
@@ -100,10 +123,17 @@ def render(
     budget: int | None,
     backend: Any,
     two_sided: bool,
+    path: Path | None,
+    turntable: int | None,
+    fps: float,
+    animation: str,
     cache: str | None,
     as_json: bool,
 ) -> None:
-    """Draw MODEL, a path or address of a .lpc file, into OUT.png."""
+    """Draw MODEL, a path or address of a .lpc file, into OUT.png.
+
+    With --path or --turntable, into OUT-0001.png, OUT-0002.png, ... and an animated file.
+    """
     from .render.backend import Style
     from .render.picture import save_png
     from .still import StillOptions, draw_still
@@ -119,6 +149,11 @@ def render(
         threads=min(os.cpu_count() or 1, MOST_THREADS),
         style=Style(two_sided=two_sided),
     )
+    if path is not None or turntable is not None:
+        if path is not None and (view is not None or turntable is not None):
+            raise click.UsageError("--path excludes --view and --turntable")
+        _sequence(model, out, options, path, turntable, fps, animation, choose_cache(cache, model), as_json)
+        return
     with Waiting() as waiting:
         still = asyncio.run(draw_still(model, options, cache=choose_cache(cache, model), progress=waiting.show))
     save_png(still.frame.rgb, out)
@@ -133,6 +168,59 @@ def render(
             f"{out}: {figures['splats']:,} splats of {figures['clouds']:,} clouds{starved},"
             f" {figures['frame_ms']:.1f} ms on {figures['backend']}, {figures['bytes_read']:,} bytes read"
         )
+
+
+def _sequence(
+    model: str,
+    out: Path,
+    options: StillOptions,
+    path: Path | None,
+    turntable: int | None,
+    fps: float,
+    animation: str,
+    cache: Cache | None,
+    as_json: bool,
+) -> None:
+    """Draw the pictures of a path or turntable."""
+    from pointstream.progress import progress
+
+    from .camera import Camera
+    from .sequence import draw_sequence, path_views, turntable_views
+    from .stream.path import ViewPath
+
+    along = None if path is None else path_views(ViewPath.read(path), fps)
+    if along is not None and len(along) > MOST_PICTURES:
+        raise click.UsageError(f"{len(along):,} pictures are more than {MOST_PICTURES:,}: lower --fps")
+
+    def views_of(header: Header) -> list[dict[str, Any]]:
+        if along is not None:
+            return along
+        size = {"width": options.width, "height": options.height}
+        if options.view is not None:
+            return turntable_views(Camera.from_view(options.view, **size), turntable or 1)
+        return turntable_views(Camera.frame_model(header, **size), turntable or 1, header.bounds)
+
+    with progress("drawing", turntable or len(along or ())) as step:
+        report = asyncio.run(
+            draw_sequence(
+                model,
+                views_of,
+                out,
+                options,
+                fps=fps,
+                animation=animation,
+                cache=cache,
+                progress=step,
+            )
+        )
+    if as_json:
+        click.echo(json.dumps(asdict(report)))
+        return
+    beside = f" and {report.animation}" if report.animation else ""
+    click.echo(
+        f"{report.first} to {report.last}{beside}: {report.pictures} pictures of up to {report.splats:,} splats,"
+        f" {report.frame_ms:.1f} ms on {report.backend}, {report.bytes_read:,} bytes read"
+    )
 
 
 class Waiting:

@@ -30,6 +30,8 @@ from .settle import settle
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from numpy.typing import NDArray
+
     from lpc.index import IndexTree
     from pointlink.profiles import Profile
     from pointstream.cache import Cache
@@ -45,7 +47,7 @@ class Estimate:
     tolerance : float
         Pixels.
     bytes : int
-        Body bytes from opening the model to the last cloud of the view.
+        Body bytes, from opening the model to the last cloud of the view.
     cloud_bytes, page_bytes : int
         What of them is clouds and pages of the view; the rest is the header, and what else the first request brings.
     clouds, pages, splats : int
@@ -102,18 +104,25 @@ class EstimateOptions:
     patience: float = 60.0
 
 
-def view_bytes(index: IndexTree, nodes: np.ndarray[Any, np.dtype[np.int64]], *, probe: int = HEADER_PROBE) -> int:
-    """Bytes of a run that ends with these clouds: the first request, and what of their pages and clouds is behind it.
+def view_bytes(index: IndexTree, nodes: NDArray[np.int64], options: SchedulerOptions) -> int:
+    """Bytes of a run that ends with these clouds.
+
+    The first request, and what of the clouds and their pages is behind it; gaps that cost less than another request are
+    read with their neighbours.
 
     Parameters
     ----------
     nodes : (n,) int64
         Known nodes.
     """
-    stops = index.offset[nodes] + index.size[nodes]
-    clouds = np.minimum(index.size[nodes], np.maximum(stops - probe, 0)).sum()
-    behind = [page_bytes(index.header, page) for page in _pages_read(index) if index.page_offset[page] >= probe]
-    return min(probe, index.header.bytes) + int(clouds) + sum(behind)
+    probe = min(HEADER_PROBE, index.header.bytes)
+    pages = [index.page_range(page) for page in _pages_read(index)]
+    starts = np.concatenate([[0], index.offset[nodes], [page.start for page in pages]])
+    stops = np.concatenate([[probe], index.offset[nodes] + index.size[nodes], [page.stop for page in pages]])
+    order = np.argsort(starts, kind="stable")
+    starts, reached = starts[order], np.maximum.accumulate(stops[order])
+    gaps = np.maximum(starts[1:] - reached[:-1], 0)
+    return int(reached[-1] - gaps[gaps > options.overhead].sum())
 
 
 def link_seconds(size: int, rate: float, rtt: float, options: SchedulerOptions) -> float:
@@ -158,10 +167,11 @@ async def estimate(
         if options.profile is not None:
             rate, rtt = options.profile.down_rate, options.profile.rtt
             rate = None if rate is None else rate / 8
-        size = view_bytes(index, cut.nodes)
+        scheduler = LayerOptions().scheduler
+        size = view_bytes(index, cut.nodes, scheduler)
         seconds = None
         if rate is not None and rtt is not None:
-            seconds = round(link_seconds(size, rate, rtt, LayerOptions().scheduler), 3)
+            seconds = round(link_seconds(size, rate, rtt, scheduler), 3)
         return Estimate(
             tolerance=options.tolerance,
             bytes=size,

@@ -97,9 +97,9 @@ async def draw_still(
     store = open_store(target, clock=time.monotonic, cache=cache)
     layer = await AccessLayer.open(store, options=LayerOptions(capacity=CAPACITY), clock=time.monotonic)
     try:
-        look = partial(_look, options=options)
+        look = partial(cut_of, options=options)
         cut = await settle(layer, look, clock=time.monotonic, patience=options.patience, progress=progress)
-        camera = _camera(layer, options)
+        camera = camera_of(layer, options)
         backend = open_backend(options.backend, layer.header, threads=options.threads)
         try:
             backend.draw(cut, layer.take, camera, options.style)  # uploads, and compiles at the first use
@@ -124,15 +124,16 @@ async def draw_still(
         await layer.close()
 
 
-def _camera(layer: AccessLayer, options: StillOptions) -> Camera:
+def camera_of(layer: AccessLayer, options: StillOptions) -> Camera:
+    """Return the camera of a still, once the model is open."""
     if options.view is None:
         return Camera.frame_model(layer.header, width=options.width, height=options.height)
     return Camera.from_view(options.view, width=options.width, height=options.height)
 
 
-def _look(layer: AccessLayer, options: StillOptions) -> Cut:
+def cut_of(layer: AccessLayer, options: StillOptions) -> Cut:
     """Compute the cut of what is here; a budget counts what is known, so that it settles on what will be here."""
-    camera, tolerance = _camera(layer, options), options.tolerance
+    camera, tolerance = camera_of(layer, options), options.tolerance
     one_sided = not options.style.two_sided
     if options.budget is not None:
         tolerance = tolerance_for_budget(
