@@ -60,7 +60,7 @@ class Attribute:
             raise Corrupt(f"attribute {self.name}: scale {self.scale} is not positive")
         try:
             item = np.dtype(self.dtype)
-        except TypeError as error:
+        except (TypeError, ValueError, SyntaxError) as error:  # numpy evaluates what looks like a list of fields
             raise Corrupt(f"attribute {self.name}: dtype {self.dtype!r} is none of numpy's") from error
         if item.kind not in "iuf" or item.itemsize > 8:
             raise Corrupt(f"attribute {self.name}: dtype {self.dtype!r} is not a plain number")
@@ -130,7 +130,7 @@ class Attribute:
         try:
             return cls(name=str(entry["name"]), kind=entry["kind"], dtype=str(entry["dtype"]), bits=int(entry["bits"]),
                        offset=int(entry["offset"]), scale=int(entry["scale"]))
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             if isinstance(error, Corrupt):
                 raise
             raise Corrupt(f"header: attribute entry {str(entry)[:80]} cannot be read") from error

@@ -39,7 +39,7 @@ class Constant:
                 raise Corrupt(f"header: constant of dtype {self.dtype!r} is not a plain number")
             with np.errstate(over="raise"):
                 np.array(self.value, dtype=item)
-        except (TypeError, ValueError, OverflowError, FloatingPointError) as error:
+        except (TypeError, ValueError, SyntaxError, OverflowError, FloatingPointError) as error:
             if isinstance(error, Corrupt):
                 raise
             raise Corrupt(f"header: constant {self.value} does not fit dtype {self.dtype!r}") from error

@@ -142,7 +142,7 @@ class HttpStore(KeepsNothing):
                 break
             before = body.offset
             while (wait := self._breaker.check(self._clock())) > 0.0:
-                await asyncio.sleep(wait)  # noqa: ASYNC110 - on the clock of the breaker
+                await asyncio.sleep(wait)
             try:
                 moved = await self._attempt(body)
             except Retry as retry:
@@ -229,7 +229,7 @@ class HttpStore(KeepsNothing):
         return headers
 
     async def _take(self, response: httpx.Response, wanted: ByteRange, body: _Body, watch: _Watch, lane: Lane) -> bool:
-        verdict = judge(response.status_code, response.headers, wanted, self._pins, self.host)
+        verdict = judge(response.status_code, response.headers, wanted, self._pins, self.name)
         if not isinstance(verdict, Part | Whole):
             lane.spoiled = True  # its body is not read
             if isinstance(verdict, Beyond):
@@ -271,7 +271,7 @@ class HttpStore(KeepsNothing):
                 watch.count(len(chunk))
                 data += chunk
                 if len(data) > whole.limit:
-                    raise ranges_unsupported(self.host, whole.length)
+                    raise ranges_unsupported(self.name, whole.length)
         if whole.length is not None and len(data) != whole.length:
             raise Retry(f"the body has {len(data)} bytes in place of {whole.length}")
         self._whole, self.length = bytes(data), len(data)
