@@ -4,7 +4,8 @@ A *cut* is the set of nodes to draw: closed under parents, because a node's clou
 The traversal is LPC's, coarse to fine and stateless, but takes a level of the tree at a time: a level's frontier is an
 array of node numbers and every test below is one numpy expression over it.
 
-1. A node outside the frustum, or whose normals all point away from the eye, is dropped with its branch.
+1. A node outside the frustum, whose normals all point away from the eye, or that was found hidden behind others
+   (`occlusion`), is dropped with its branch.
 2. Its *projected spacing* is the apparent size, in pixels, of a sphere of diameter r_j at the point of its bounding
    sphere nearest to the eye; infinite where the eye is inside. Below the tolerance the node is fine enough.
 3. Otherwise its children refine it: one whose record is unknown makes its page wanted; one that is not resident is
@@ -110,8 +111,10 @@ class _Sieve:
     index: IndexTree
     camera: Camera
     cull_backfaces: bool
+    hidden: NDArray[np.bool_] | None = None
     frustum: int = 0
     backface: int = 0
+    occluded: int = 0
 
     def look(self, nodes: Nodes) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
         """Return which nodes are visible, and the projected spacing of all, pixels."""
@@ -134,9 +137,18 @@ class _Sieve:
             away &= along > distance * np.sin(spread)
             self.backface += int(np.count_nonzero(away))
             visible &= ~away
+        visible &= self.uncovered(nodes, visible)
         spacing_px = np.full(len(nodes), np.inf)
         np.divide(index.spacing[nodes] * self.camera.focal, gap, out=spacing_px, where=outside)
         return visible, spacing_px
+
+    def uncovered(self, nodes: Nodes, among: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return which nodes were not found hidden, and count those of `among` that were."""
+        if self.hidden is None:
+            return np.ones(nodes.shape, dtype=bool)
+        hidden = self.hidden[nodes]
+        self.occluded += int(np.count_nonzero(hidden & among))
+        return ~hidden
 
 
 def _descend(sieve: _Sieve, tolerance: float, resident: NDArray[np.bool_]) -> Iterator[_Level]:
@@ -156,7 +168,9 @@ def _descend(sieve: _Sieve, tolerance: float, resident: NDArray[np.bool_]) -> It
         visible[known], child_spacing_px[known] = sieve.look(children[known])
         drawn = visible.copy()
         drawn[visible] = resident[children[visible]]
-        missing = (visible & ~drawn) | (exists & ~known)
+        unknown = exists & ~known
+        unknown &= sieve.uncovered(children, unknown)
+        missing = (visible & ~drawn) | unknown
         yield _Level(nodes, spacing_px, children, drawn, missing, child_spacing_px)
         nodes, spacing_px = children[drawn], child_spacing_px[drawn]
 
@@ -170,6 +184,7 @@ def refine(
     priority: Priority = "index",
     cull_backfaces: bool = True,
     splat_rule: SplatRule = "place",
+    hidden: NDArray[np.bool_] | None = None,
 ) -> Cut:
     """Compute the cut of one frame.
 
@@ -187,6 +202,8 @@ def refine(
     splat_rule : {"place", "paper"}
         What a splat's size follows: the deepest drawn node at its place, or, as in LPC 4, the cloud: the spacing of its
         node where that is starved or fine enough, the tolerance where it is refined.
+    hidden : (n_nodes,) bool, optional
+        Nodes that `occlusion` found to be behind others: neither drawn nor refined nor wanted.
 
     Notes
     -----
@@ -194,7 +211,7 @@ def refine(
     """
     if not index.known[0]:
         return _empty(wants=[0], pages=[0], culled=Culled())
-    sieve = _Sieve(index, camera, cull_backfaces)
+    sieve = _Sieve(index, camera, cull_backfaces, hidden)
     if not resident[0]:
         visible, _ = sieve.look(np.zeros(1, dtype=np.int64))
         return _empty(wants=[0] if visible[0] else [], pages=[], culled=_culled(sieve))
@@ -310,7 +327,7 @@ def _error_per_byte(
 
 
 def _culled(sieve: _Sieve) -> Culled:
-    return Culled(frustum=sieve.frustum, backface=sieve.backface)
+    return Culled(frustum=sieve.frustum, backface=sieve.backface, occluded=sieve.occluded)
 
 
 def _empty(*, wants: list[int], pages: list[int], culled: Culled) -> Cut:

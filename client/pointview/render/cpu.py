@@ -17,6 +17,7 @@ from . import kernels, shading
 from .arena import Arena
 from .backend import Frame, Style, Take
 from .pack import Packer
+from .seen import place_table
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -59,7 +60,7 @@ class CpuBackend:
         if self._layers.shape[1:] != shape:
             self._layers = np.empty((self._threads, *shape), dtype=np.uint64)
         clouds, cloud_of_block = self._clouds(cut, camera)
-        places, halvings = _places(cut)
+        places, halvings = place_table(cut)
         view = self._view(cut, camera, style)
         light = self._light(camera, style)
         rotation = camera.rotation().astype(np.float32)
@@ -182,18 +183,6 @@ class CpuBackend:
         work(0)
         for other in others:
             other.result()
-
-
-def _places(cut: Cut) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return a cut's places as the kernels read them."""
-    if cut.places is None:
-        return np.empty(0, dtype=kernels.PLACE), np.empty(0, dtype=kernels.HALVING)
-    places = np.empty(len(cut.nodes), dtype=kernels.PLACE)
-    places["lower"], places["upper"] = cut.places.link.T
-    places["lower_spacing"], places["upper_spacing"] = cut.places.spacing.T
-    halvings = np.empty(len(cut.places.axis), dtype=kernels.HALVING)
-    halvings["axis"], halvings["half"] = cut.places.axis, cut.places.half
-    return places, halvings
 
 
 def _grown(array: NDArray[Any], rows: int) -> NDArray[Any]:

@@ -557,3 +557,54 @@ def close_holes(
                             break
                     step += 1 if step < 4 else step // 2
             source[row, column] = best if found >= walls else row * width + column
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def count_cells(
+    counts: NDArray[np.int64],
+    depth: NDArray[np.float32],
+    places: NDArray[Any],
+    halvings: NDArray[Any],
+    eye: NDArray[np.float32],
+    rotation: NDArray[np.float32],
+    focal: float,
+) -> None:  # pragma: no cover - compiled
+    """Add the covered pixels to the halves of cells that their surface lies in, and to all cells around these.
+
+    Parameters
+    ----------
+    counts : (n, 2) int64
+        For the lower and the upper half of the cell of each node of `places`.
+    depth : (h, w) float32
+    eye : (3,) float32
+        Relative to the corner of the root's cell.
+    """
+    height, width = depth.shape
+    inverse = F(1.0 / focal)
+    for line in range(height):
+        up = (F(0.5) * F(height) - F(line) - F(0.5)) * inverse
+        for column in range(width):
+            here = depth[line, column]
+            if here == np.inf:
+                continue
+            right = (F(column) + F(0.5) - F(0.5) * F(width)) * inverse
+            x = eye[0] + here * (rotation[0, 0] * right + rotation[1, 0] * up + rotation[2, 0])
+            y = eye[1] + here * (rotation[0, 1] * right + rotation[1, 1] * up + rotation[2, 1])
+            z = eye[2] + here * (rotation[0, 2] * right + rotation[1, 2] * up + rotation[2, 2])
+            row, level = 0, 0
+            while row >= 0:
+                axis, half, place = halvings[level].axis, halvings[level].half, places[row]
+                along = x if axis == 0 else (y if axis == 1 else z)
+                if along >= half:
+                    counts[row, 1] += 1
+                    row = place.upper
+                    if axis == 0:
+                        x -= half
+                    elif axis == 1:
+                        y -= half
+                    else:
+                        z -= half
+                else:
+                    counts[row, 0] += 1
+                    row = place.lower
+                level += 1

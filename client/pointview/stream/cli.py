@@ -47,6 +47,13 @@ LONGEST = 3600.0
     type=click.Choice(["place", "paper"]),
     help="A splat's size follows the data at its place, or, as in the paper, its cloud.",
 )
+@click.option(
+    "--occlusion",
+    default="auto",
+    show_default=True,
+    type=click.Choice(["auto", "off"]),
+    help="Whether to leave out what is hidden, where that pays.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print report.json on stdout.")
 def stream(
     model: str,
@@ -60,6 +67,7 @@ def stream(
     tolerance: float,
     priority: str,
     splat_rule: str,
+    occlusion: str,
     as_json: bool,
 ) -> None:
     """Stream MODEL over a link and report its error against run time."""
@@ -91,6 +99,7 @@ def stream(
         tolerance=tolerance,
         priority="error" if priority == "error" else "index",
         splat_rule="paper" if splat_rule == "paper" else "place",
+        occlusion="off" if occlusion == "off" else "auto",
         views=views,
     )
     prepare_folder(report)
@@ -108,6 +117,7 @@ def stream(
     click.echo(f"settled         {settled}")
     click.echo(f"received        {result.bytes:,} bytes in {result.requests} requests")
     click.echo(f"link used       {use}")
+    click.echo(f"hidden          {result.occlusion_note or f'{result.occluded:,} branches left out'}")
     click.echo(f"report          {written[0]}")
 
 

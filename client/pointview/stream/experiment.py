@@ -7,7 +7,7 @@ import os
 import time
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -59,6 +59,7 @@ class Experiment:
         Pixels.
     priority : {"index", "error"}
     splat_rule : {"place", "paper"}
+    occlusion : {"auto", "off"}
     views : ViewPath, optional
         Where the camera is; the whole model without.
     """
@@ -72,6 +73,7 @@ class Experiment:
     tolerance: float
     priority: Priority
     splat_rule: SplatRule = "place"
+    occlusion: Literal["auto", "off"] = "auto"
     views: ViewPath | None = None
 
     def camera_at(self, header: Header, t: float) -> Camera:
@@ -89,6 +91,7 @@ class Experiment:
             tolerance=self.tolerance,
             priority=self.priority,
             splat_rule=self.splat_rule,
+            occlusion=self.occlusion == "auto",
             threads=min(os.cpu_count() or 1, MOST_THREADS),
         )
 
@@ -185,6 +188,9 @@ def _report(experiment: Experiment, recording: Recording, curve: Sequence[dict[s
         clock=experiment.clock,
         priority=experiment.priority,
         splat_rule=experiment.splat_rule,
+        occlusion=experiment.occlusion,
+        occluded=recording.occluded,
+        occlusion_note=recording.occlusion_note,
         size=experiment.size,
         seconds=experiment.seconds,
         samples=recording.samples,

@@ -34,6 +34,9 @@ class Report:
     clock: str
     priority: str
     splat_rule: str
+    occlusion: str
+    occluded: int
+    occlusion_note: str | None
     size: tuple[int, int]
     seconds: float
     samples: int

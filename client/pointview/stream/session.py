@@ -11,11 +11,13 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 import zstandard
 
+from pointview.occlusion import KEPT, Occlusion
 from pointview.refine import Cut, Priority, SplatRule, refine
 from pointview.render import Kind, Style, open_backend
 
@@ -29,6 +31,9 @@ if TYPE_CHECKING:
     from pointview.render import Backend, Frame
 
 Clock = Callable[[], float]
+
+TEST_EVERY = 6
+"""Frames from one test of what is hidden to the next."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,6 +50,8 @@ class SessionOptions:
         Order of the wants.
     splat_rule : {"place", "paper"}
         What the size of a splat follows.
+    occlusion : bool
+        Leave out what is hidden, where that pays.
     frame_interval : float
         Seconds between two frames.
     backend : {"auto", "gl", "cpu"}
@@ -57,6 +64,7 @@ class SessionOptions:
     tolerance: float = 1.0
     priority: Priority = "index"
     splat_rule: SplatRule = "place"
+    occlusion: bool = True
     frame_interval: float = 1.0 / 30.0
     backend: Kind = "auto"
     threads: int = 1
@@ -140,6 +148,10 @@ class Recording:
         Longest time that one frame held the loop up; only a real clock sees any.
     samples : int
         Samples resident at the end: those that were received, unless the capacity of the layer was too small.
+    occluded : int
+        Branches that the last cut left out because they are hidden.
+    occlusion_note : str or None
+        Why occlusion culling was off at the end.
     header : Header, optional
         Of the model that was there at the end.
     """
@@ -151,6 +163,8 @@ class Recording:
     frames: int = 0
     longest_frame_s: float = 0.0
     samples: int = 0
+    occluded: int = 0
+    occlusion_note: str | None = None
     header: Header | None = None
 
 
@@ -218,6 +232,9 @@ class _Session:
         self.layer, self.camera_at, self.options = layer, camera_at, options
         self.clock, self.start, self.drawer, self.tell = clock, start, drawer, tell
         self.recording = Recording()
+        self.occlusion: Occlusion | None = None
+        self.tested: tuple[object, ...] = ()
+        self.steady = 0
 
     async def run(self) -> Recording:
         options, recording, clock = self.options, self.recording, self.clock
@@ -236,9 +253,13 @@ class _Session:
                     due = [t for t in due if t > now]
                     if not due:
                         self._take_stock()  # before the last picture: more arrives while it is drawn
-                    recording.moments.append(await self._look(backend, cut, camera, now - self.start))
+                    stats = self.layer.stats  # more arrives while the picture is drawn
+                    cut, frame = await self._draw(backend, cut, camera)
+                    recording.moments.append(self._moment(cut, camera, frame, now - self.start, stats))
                     if not due:
                         return recording
+                elif self._is_test_due(cut, camera):
+                    await self._draw(backend, cut, camera)
                 recording.longest_frame_s = max(recording.longest_frame_s, clock() - now)
                 # A frame lands exactly on the next moment to look at, so that the report's times are the asked ones.
                 next_frame = min([next_frame + options.frame_interval, *due[:1]])
@@ -253,15 +274,7 @@ class _Session:
         """Refine and ask: what every frame does, drawn or not."""
         layer, recording = self.layer, self.recording
         camera = self.camera_at(layer.header, t)
-        cut = refine(
-            layer.index,
-            camera,
-            self.options.tolerance,
-            layer.resident,
-            priority=self.options.priority,
-            splat_rule=self.options.splat_rule,
-            cull_backfaces=not self.options.style.two_sided,
-        )
+        cut = self._refine(camera)
         layer.end_frame(cut.wants, pinned=cut.nodes)
         recording.frames += 1
         if len(cut.nodes):
@@ -277,14 +290,52 @@ class _Session:
         recording.stats, recording.header = layer.stats, layer.header
         recording.samples = int(layer.index.samples[layer.resident].sum())
 
-    async def _look(self, backend: Backend, cut: Cut, camera: Camera, t: float) -> Moment:
-        """Draw a cut and note the state that it was drawn from."""
-        stats = self.layer.stats
-        clouds = {node: self.layer.take(node) for node in cut.nodes.tolist()}
-        style = self.options.style
-        frame = await asyncio.get_running_loop().run_in_executor(
-            self.drawer, lambda: backend.draw(cut, clouds.__getitem__, camera, style)
+    def _refine(self, camera: Camera) -> Cut:
+        layer, options = self.layer, self.options
+        nodes = layer.header.nodes
+        if not options.occlusion or options.splat_rule != "place":
+            self.occlusion = None
+        elif self.occlusion is None or len(self.occlusion.hidden) != nodes:
+            self.occlusion = Occlusion(nodes)
+        return refine(
+            layer.index,
+            camera,
+            options.tolerance,
+            layer.resident,
+            priority=options.priority,
+            splat_rule=options.splat_rule,
+            cull_backfaces=not options.style.two_sided,
+            hidden=None if self.occlusion is None else self.occlusion.hidden,
         )
+
+    def _is_test_due(self, cut: Cut, camera: Camera) -> bool:
+        """Tell whether the picture should be asked for what is hidden: every few frames, if anything changed."""
+        if self.occlusion is None or self.recording.frames % TEST_EVERY:
+            return False
+        state = (cut.nodes.tobytes(), camera)
+        self.steady = self.steady + 1 if state == self.tested else 0
+        self.tested = state
+        return self.steady <= KEPT
+
+    async def _draw(self, backend: Backend, cut: Cut, camera: Camera) -> tuple[Cut, Frame]:
+        """Draw a cut, and once more with what it shows to be visible after all (LPC 4: the third pass)."""
+        layer, style, drawer = self.layer, self.options.style, asyncio.get_running_loop().run_in_executor
+        index = layer.index
+        for last in (False, True):
+            clouds = {node: layer.take(node) for node in cut.nodes.tolist()}
+            frame = await drawer(self.drawer, partial(backend.draw, cut, clouds.__getitem__, camera, style))
+            if self.occlusion is None or layer.index is not index:
+                break
+            seen = self.occlusion.look(index, cut, camera, frame)
+            if last or not seen:
+                break
+            cut = self._refine(camera)
+        return cut, frame
+
+    def _moment(self, cut: Cut, camera: Camera, frame: Frame, t: float, stats: LayerStats) -> Moment:
+        """Note the state that a picture was drawn from."""
+        self.recording.occluded = cut.culled.occluded
+        self.recording.occlusion_note = None if self.occlusion is None else self.occlusion.verdict
         return Moment(
             t=t,
             stats=stats,

@@ -19,7 +19,8 @@ CONTRACT = [
     "curve",
 ]  # fmt: skip
 EXTRA = [
-    "model", "priority", "splat_rule", "size", "seconds", "model_samples", "model_bytes", "payload_bytes", "wanted_s",
+    "model", "priority", "splat_rule", "occlusion", "occluded", "occlusion_note",
+    "size", "seconds", "model_samples", "model_bytes", "payload_bytes", "wanted_s",
     "frames", "errors",
 ]  # fmt: skip
 ENTRY = [
