@@ -89,7 +89,7 @@ def random_records(shape: list[int], rng: np.random.Generator) -> NDArray[Any]:
     records = np.zeros(count, RECORD)
     records["children"] = bits
     records["center"] = rng.integers(0, 2**32, (count, 3))
-    records["radius"] = rng.uniform(0, 10, count)
+    records["radius"] = rng.uniform(7, 10, count)  # all meet in the box of `fake_model`
     records["spacing"] = rng.uniform(0.01, 1, count)
     records["samples"] = rng.integers(1, 65, count)
     records["size"] = rng.integers(16, 60, count)

@@ -119,6 +119,7 @@ class IndexTree:
         # Rows that are not `known` may hold anything, so they are written before the last checks.
         self._write_rows(offset, parsed)
         self._check_subtrees(page, first, stop)
+        self._check_spheres(page, first, stop)
         levels = self._levels_below(page, first, stop)
         # Nothing fails from here on.
         self.known[first:stop] = True
@@ -237,6 +238,20 @@ class IndexTree:
             wrong = total != self.subtree[nodes] - self.samples[nodes]
             if wrong.any():
                 raise Corrupt(f"page {page}: samples below node {nodes[np.argmax(wrong)]} do not add up")
+
+    def _check_spheres(self, page: int, first: int, stop: int) -> None:
+        """Check that the spheres of parents and children meet: both hold the samples of the child's subtree."""
+        own = np.arange(first, stop)
+        below = self.children[first:stop]
+        come = (below >= 0) & (self.known[below] | ((below >= first) & (below < stop)))
+        linked = own[self._has_parent[first:stop] & (self.parent[first:stop] >= 0)]
+        parents = np.concatenate([np.repeat(own, come.sum(axis=1)), self.parent[linked]])
+        children = np.concatenate([below[come], linked])
+        away = np.sqrt(((self.center[parents] - self.center[children]) ** 2).sum(axis=1))
+        slack = 1e-6 * self.header.side + 1e-12 * np.abs(self.center[parents]).max(initial=0.0)
+        apart = away > self.radius[parents] + self.radius[children] + slack
+        if apart.any():
+            raise Corrupt(f"page {page}: the sphere of node {children[np.argmax(apart)]} is nowhere near its parent's")
 
     def _levels_below(self, page: int, first: int, stop: int) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
         """Levels that become known through this page: mostly of its children, deeper where pages below came first."""

@@ -142,7 +142,7 @@ def forged(data: bytes, node: int, change: Callable[[Any], None] | None = None, 
 
 def record(offset: int, layout: str, value: Any, node: int = 60) -> Callable[[bytes], bytes]:
     def change(bytes_of_record: Any) -> None:
-        struct.pack_into(layout, bytes_of_record, offset, value)
+        struct.pack_into(layout, bytes_of_record, offset, *(value if isinstance(value, tuple) else (value,)))
 
     return lambda data: forged(data, node, change)
 
@@ -362,6 +362,12 @@ HOSTILE = [
         data=record(12, "<f", float("nan")),
     ),
     Row(name="page: negative radius", shown="all but the damaged", report=DAMAGE, data=record(12, "<f", -1.0)),
+    Row(
+        name="page: a child far from its parent",
+        shown="all but the damaged",
+        report=DAMAGE,
+        data=record(0, "<IIIf", (0, 0, 0, 0.0)),
+    ),
     Row(name="page: 2^32 - 1 samples", shown="all but the damaged", report=DAMAGE, data=record(20, "<I", 2**32 - 1)),
     Row(name="page: subtree overflows", shown="all but the damaged", report=DAMAGE, data=record(24, "<Q", 2**63 + 5)),
     Row(name="page: cloud beyond the file", shown="all but the damaged", report=DAMAGE, data=record(32, "<I", 2**31)),

@@ -157,6 +157,20 @@ def test_a_refused_page_changes_nothing_and_the_true_one_still_fits(model: FakeM
     check_against(tree, model)
 
 
+@pytest.mark.parametrize("order", [(0, 1, 2), (0, 2, 1)])
+def test_a_child_far_from_its_parent_is_refused_with_whichever_page_comes_last(order: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(1)
+    records = random_records([3] * 7, rng)
+    records["center"], records["radius"] = 2**31, 1.0
+    records["center"][12], records["radius"][12] = 0, 0.1
+    model = fake_model(records, 5, rng)
+    tree = IndexTree(model.header)
+    for page in order[:-1]:
+        tree.add_page(page, model.pages[page][1])
+    with pytest.raises(Corrupt, match="sphere of node 12"):
+        tree.add_page(order[-1], model.pages[order[-1]][1])
+
+
 def lie(model: FakeModel, page: int, field: str, row: int, value: int) -> bytes:
     packed = bytearray(model.pages[page][1])
     records = np.frombuffer(packed, RECORD, offset=PAGE_HEADER)
