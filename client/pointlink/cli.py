@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import signal
-import sys
 from typing import TYPE_CHECKING
 
 import click
@@ -49,8 +48,7 @@ def link(upstream: Upstream, profile: Profile, host: str, port: int) -> None:
         with asyncio.Runner(loop_factory=precise_loop) as runner:
             runner.run(_serve(upstream, profile, host, port))
     except LpcError as error:
-        click.echo(str(error), err=True)
-        sys.exit(1)
+        raise click.ClickException(str(error)) from error
 
 
 async def _serve(upstream: Upstream, profile: Profile, host: str, port: int) -> None:

@@ -18,11 +18,19 @@ class Assembly:
     ----------
     start : int
         Where the range starts in the file.
+
+    Attributes
+    ----------
+    data : bytearray
+        What has come.
+    used : int
+        Where the last object that was given out ends in the file.
     """
 
     def __init__(self, start: int, items: Iterable[Item] = ()) -> None:
         self.start = start
         self.data = bytearray()
+        self.used = start
         self._expected: list[tuple[int, Item]] = []
         self.expect(items)
 
@@ -44,8 +52,13 @@ class Assembly:
         self.data += chunk
         return len(self.data) - before
 
+    def rest(self) -> tuple[int, bytes]:
+        """Give what has come behind the last object given out, the start of the next one, and where it begins."""
+        return self.used, bytes(self.data[self.used - self.start :])
+
     def complete(self) -> Iterator[tuple[Item, bytes]]:
         """Give out the objects that are complete, each once, in order of place, with their bytes."""
         while self._expected and self._expected[0][0] <= self.start + len(self.data):
-            _, item = heapq.heappop(self._expected)
+            stop, item = heapq.heappop(self._expected)
+            self.used = max(self.used, stop)
             yield item, bytes(self.data[item.start - self.start : item.stop - self.start])

@@ -44,6 +44,8 @@ class Build:
         Arrived and being decoded.
     held : ndarray, (nodes,) bool
         The store has them without asking over a link.
+    tail : (int, bytes)
+        The start of an object that the opening cut in two, and where in the file it begins; given out once.
     """
 
     def __init__(self, index: IndexTree, *, capacity: int, store: Store) -> None:
@@ -55,6 +57,7 @@ class Build:
         self.held: NDArray[np.bool_] = np.zeros(len(index), dtype=bool)
         self.length = index.header.bytes if store.length is None else min(index.header.bytes, store.length)
         self.lost_pages: set[int] = set()
+        self.tail: tuple[int, bytes] = (0, b"")
         self._failures: dict[int, int] = {}
         for page in np.flatnonzero(index.page_loaded).tolist():
             self.page_came(page)
@@ -66,6 +69,14 @@ class Build:
         stops = self.index.offset[rows] + self.index.size[rows]
         self.held[rows] = self._store.holds(self.index.offset[rows], stops)
         self.absent[rows] = (stops > self.length) | (self._store.partial & ~self.held[rows])
+
+    def take_tail(self, wanted: ByteRange) -> bytes:
+        """Give the first bytes of a range, if they came with the opening and others are still to come."""
+        start, data = self.tail
+        if wanted.start != start or not data or wanted.size <= len(data):
+            return b""
+        self.tail = (0, b"")
+        return data
 
     def ends_at(self, length: int) -> None:
         """Learn that the file is shorter than thought."""

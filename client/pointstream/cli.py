@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import time
 from contextlib import ExitStack
 from importlib.metadata import entry_points
@@ -14,6 +15,7 @@ import click
 
 from lpc.errors import ScanError
 
+from .arguments import BOUNDS, COUNT, DEEPEST, POSITIVE
 from .cache import Cache
 from .model import open_model
 from .progress import progress
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
 
     from lpc.points import PointBatch
 
+    from .arguments import Bounds
     from .model import Model
 
 JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
@@ -78,37 +81,24 @@ def verify(model: str, scans: tuple[str, ...], more: tuple[str, ...], as_json: b
     else:
         _print_report(report)
     if not report.ok:
+        others = f" (and {len(report.problems) - 1} more)" if len(report.problems) > 1 else ""
+        click.echo(f"pointstream: {model}: {report.problems[0]}{others}", err=True)
         click.get_current_context().exit(1)
-
-
-def _parse_bounds(
-    ctx: click.Context, param: click.Parameter, value: str | None
-) -> tuple[float, float, float, float, float, float] | None:
-    if value is None:
-        return None
-    try:
-        bounds = tuple(float(part) for part in value.split(","))
-    except ValueError as error:
-        raise click.BadParameter(f"{value!r} is not six numbers X0,Y0,Z0,X1,Y1,Z1", ctx, param) from error
-    if len(bounds) != 6 or not all(low <= high for low, high in zip(bounds[:3], bounds[3:], strict=True)):
-        raise click.BadParameter(f"{value!r} is not X0,Y0,Z0,X1,Y1,Z1 with X0 <= X1 and so on", ctx, param)
-    x0, y0, z0, x1, y1, z1 = bounds
-    return x0, y0, z0, x1, y1, z1
 
 
 @click.command()
 @click.argument("model")
 @click.argument("out", type=click.Path(dir_okay=False, path_type=Path))
-@click.option("--level", type=click.IntRange(min=0), help="Deepest level of the tree, 0 for the root alone.")
-@click.option("--spacing", type=click.FloatRange(min=0, min_open=True), help="Detail that is enough, model units.")
-@click.option("--bounds", callback=_parse_bounds, help="X0,Y0,Z0,X1,Y1,Z1 in model units: only samples inside.")
+@click.option("--level", type=click.IntRange(0, DEEPEST), help="Deepest level of the tree, 0 for the root alone.")
+@click.option("--spacing", type=POSITIVE, help="Detail that is enough, model units.")
+@click.option("--bounds", type=BOUNDS, help="X0,Y0,Z0,X1,Y1,Z1 in model units: only samples inside.")
 @CACHE
 def export(
     model: str,
     out: Path,
     level: int | None,
     spacing: float | None,
-    bounds: tuple[float, float, float, float, float, float] | None,
+    bounds: Bounds | None,
     cache: str | None,
 ) -> None:
     """Write the samples of MODEL to OUT.{ply,las,laz,xyz,npz}, every one once."""
@@ -143,16 +133,14 @@ def export(
 @click.command()
 @click.argument("model")
 @click.argument("folder", metavar="DIR", type=click.Path(file_okay=False, path_type=Path))
-@click.option("--bounds", callback=_parse_bounds, help="X0,Y0,Z0,X1,Y1,Z1 in model units: only clouds that touch it.")
-@click.option("--spacing", type=click.FloatRange(min=0, min_open=True), help="Detail that is enough, model units.")
-@click.option(
-    "--bytes", "most_bytes", type=click.IntRange(min=1), help="Size of the copy, at most; coarse comes first."
-)
+@click.option("--bounds", type=BOUNDS, help="X0,Y0,Z0,X1,Y1,Z1 in model units: only clouds that touch it.")
+@click.option("--spacing", type=POSITIVE, help="Detail that is enough, model units.")
+@click.option("--bytes", "most_bytes", type=COUNT, help="Size of the copy, at most; coarse comes first.")
 @JSON
 def fetch(
     model: str,
     folder: Path,
-    bounds: tuple[float, float, float, float, float, float] | None,
+    bounds: Bounds | None,
     spacing: float | None,
     most_bytes: int | None,
     as_json: bool,
@@ -187,7 +175,7 @@ def fetch(
             f"{out}: {part}, {report.bytes:,} of {report.bytes_total:,} bytes, {report.bytes_fetched:,} of them new"
         )
     for problem in report.problems:
-        click.echo(f"pointstream: {problem}", err=True)
+        click.echo(f"pointstream: {out}: {problem}", err=True)
     if report.problems:
         click.get_current_context().exit(1)
 
@@ -246,13 +234,37 @@ def _rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "attributes", ", ".join(facts["attributes"]) or "none"
     for name, value in facts["constants"].items():
         yield f"{name} everywhere", str(value)
-    yield "crs", facts["crs"] or "none"
+    yield "crs", crs_name(facts["crs"]) if facts["crs"] else "none"
+    reasons: dict[str, list[str]] = {}
     for name, why in facts["left_out"].items():
-        yield f"left out: {name}", why
+        reasons.setdefault(why, []).append(name)
+    for why, names in reasons.items():
+        yield "left out", f"{', '.join(names)}: {why}"
     for why, count in facts["rejected"].items():
         if count:
             yield f"rejected: {why}", f"{count:,} records"
     yield "build", facts["digest"]
+
+
+_WKT = re.compile(
+    r""""(?:[^"]|"")*"|(?:ID|AUTHORITY)\s*[\[(]\s*"EPSG"\s*,\s*"?(?P<code>\d+)"?[^\])]*[\])]|(?P<open>[\[(])|(?P<close>[\])])"""
+)
+"""What matters of a WKT: quoted texts, EPSG codes, brackets."""
+
+
+def crs_name(wkt: str) -> str:
+    """Give the name of a coordinate system and its EPSG code, or those of its parts; WKT 1 and 2, without a library."""
+    name, codes, depth = "", dict[int, list[str]](), 0
+    for token in _WKT.finditer(wkt):
+        if token["code"]:
+            codes.setdefault(depth, []).append(token["code"])
+        elif token["open"] or token["close"]:
+            depth += 1 if token["open"] else -1
+        elif not name:
+            name = token[0][1:-1].replace('""', '"')
+    compound = wkt.lstrip().upper().startswith(("COMPD_CS", "COMPOUNDCRS"))
+    found = codes.get(1, []) or (codes.get(2, []) if compound else [])
+    return (name or wkt[:80]) + (f" (EPSG:{'+'.join(found)})" if found else "")
 
 
 def _print_report(report: VerifyReport) -> None:
@@ -265,5 +277,5 @@ def _print_report(report: VerifyReport) -> None:
         if match.max_normal_error_degrees is not None:
             click.echo(f"largest normal error {match.max_normal_error_degrees:.4f} degrees")
     for problem in report.problems:
-        click.echo(f"problem: {problem}", err=True)
+        click.echo(f"problem: {problem}")
     click.echo("ok" if report.ok else "not ok")

@@ -16,6 +16,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.exceptions import NoArgsIsHelpError
 
 from lpc.errors import LpcError
 
@@ -135,8 +136,13 @@ def run(arguments: Sequence[str] | None = None) -> int:
         # Outside click's standalone mode the status of ctx.exit() is what main returns.
         status = cli.main(list(sys.argv[1:] if arguments is None else arguments), "pointstream", standalone_mode=False)
         sys.stdout.flush()
-    except click.UsageError as error:
+    except NoArgsIsHelpError as error:
         error.show()
+        return error.exit_code
+    except click.UsageError as error:
+        place = "pointstream" if error.ctx is None else error.ctx.command_path
+        message = " ".join(error.format_message().split()).removesuffix(".")
+        click.echo(f"pointstream: {message}; see '{place} --help'", err=True)
         return error.exit_code
     except click.ClickException as error:
         (error if isinstance(error, Failure) else Failure(error.format_message())).show()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from .arguments import Number
 from .doctor import can_serve, diagnose
 from .remedies import recipes_for
 
@@ -21,9 +22,7 @@ _MARKS = {"good": "+", "advice": "!", "failure": "x", "unknown": "?"}
 @click.command()
 @click.argument("url")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-@click.option(
-    "--rest", default=3.0, show_default=True, type=click.FloatRange(0, 120), help="Seconds to try keep-alive."
-)
+@click.option("--rest", default=3.0, show_default=True, type=Number(0, 120), help="Seconds to try keep-alive.")
 def doctor(url: str, as_json: bool, rest: float) -> None:
     """Say whether the host of URL, a model, can serve models, and what to change; exit status 1 if it cannot.
 

@@ -10,16 +10,19 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 import numpy as np
 
 from lpc.codec import cloud_to_points
-from lpc.errors import Corrupt, StoreError
+from lpc.errors import Corrupt, LpcError, StoreError
 from lpc.info import info_dict
 from lpc.points import PointBatch
 
+from .opening import naming
 from .reading import Reader, Region
 from .stores import open_store
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Coroutine, Iterator, Sequence
     from types import TracebackType
+
+    from numpy.typing import NDArray
 
     from lpc.header import Header
     from lpc.index import IndexTree
@@ -154,7 +157,7 @@ class Model:
     ) -> int:
         """Count the samples that `read` would give at most: those of all clouds that it looks into."""
         region = _region(bounds, spacing, level)
-        return int(self.index.samples[self._loop.wait(self._reader.select(region))].sum())
+        return int(self.index.samples[self._loop.wait(_select(self._reader, region))].sum())
 
     def close(self) -> None:
         """Close the file or the connections."""
@@ -172,13 +175,21 @@ def _region(bounds: Sequence[float] | None, spacing: float | None, level: int | 
     return Region(bounds=(x0, y0, z0, x1, y1, z1), spacing=spacing, level=level)
 
 
+async def _select(reader: Reader, region: Region) -> NDArray[np.int64]:
+    try:
+        return await reader.select(region)
+    except LpcError as error:
+        naming(reader.store.name, error)
+        raise
+
+
 async def _points(reader: Reader, region: Region) -> AsyncIterator[PointBatch]:
-    nodes = await reader.select(region)
+    nodes = await _select(reader, region)
     if not len(nodes):
         yield _nothing(reader.index.header)
     async for _, cloud in reader.clouds(nodes):
         if isinstance(cloud, Corrupt):
-            raise cloud
+            raise naming(reader.store.name, cloud)
         points = cloud_to_points(cloud, reader.index.header)
         yield points if region.bounds is None else points.take(region.inside(points.xyz))
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lpc.errors import ModelChanged, Truncated
+from lpc.errors import FormatError, LpcError, ModelChanged, Truncated
 from lpc.header import HEADER_PROBE, Header, parse_header
 from lpc.index import IndexTree
 from lpc.ranges import ByteRange
@@ -75,8 +75,22 @@ class Opening:
         return True
 
 
-async def open_index(store: Store) -> IndexTree:
+def naming(name: str, error: LpcError) -> LpcError:
+    """Put the path or address before the text of an error that lacks it: people open more than one model."""
+    text = str(error)
+    if name not in text:
+        error.args = (f"{name}: {text}",)
+    return error
+
+
+async def open_index(store: Store) -> tuple[IndexTree, bytes]:
     """Read header and first page: one request of `HEADER_PROBE` bytes, more only if the header is larger.
+
+    Returns
+    -------
+    index : IndexTree
+    data : bytes
+        The file's first bytes, all that were read.
 
     Raises
     ------
@@ -86,11 +100,16 @@ async def open_index(store: Store) -> IndexTree:
     while True:
         part = await store.read(ByteRange(len(data), opening.needed))
         data += part
-        if opening.look(data, ended=len(data) < opening.needed or not part):
+        try:
+            done = opening.look(data, ended=len(data) < opening.needed or not part)
+        except FormatError as error:
+            naming(store.name, error)
+            raise
+        if done:
             assert opening.index is not None
             if vouch_opening(store, opening, data):
                 _vouch_clouds(store, opening.index, data)
-            return opening.index
+            return opening.index, data
 
 
 def vouch_opening(store: Store, opening: Opening, data: bytes | bytearray) -> bool:

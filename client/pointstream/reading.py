@@ -16,7 +16,7 @@ import numpy as np
 
 from lpc.errors import Corrupt, ModelChanged
 from lpc.page import page_bytes
-from lpc.ranges import coalesce
+from lpc.ranges import ByteRange, coalesce
 
 from .decoding import decode_checked
 from .opening import add_page, open_index
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
     from lpc.cloud import Cloud
     from lpc.index import IndexTree
-    from lpc.ranges import ByteRange
 
     from .stores import Store
 
@@ -119,11 +118,17 @@ class Reader:
     store : Store
     index : IndexTree
         Grows as pages are read.
+    options : ReadingOptions, optional
+    start : bytes
+        The file's first bytes, which are not read again.
     """
 
-    def __init__(self, store: Store, index: IndexTree, options: ReadingOptions | None = None) -> None:
+    def __init__(
+        self, store: Store, index: IndexTree, options: ReadingOptions | None = None, *, start: bytes = b""
+    ) -> None:
         self.store, self.index = store, index
         self.options = options or ReadingOptions()
+        self._start = start
 
     @classmethod
     async def open(cls, store: Store, options: ReadingOptions | None = None) -> Reader:
@@ -133,7 +138,8 @@ class Reader:
         ------
         StoreError, FormatError
         """
-        return cls(store, await open_index(store), options)
+        index, start = await open_index(store)
+        return cls(store, index, options, start=start)
 
     @property
     def length(self) -> int:
@@ -226,16 +232,27 @@ class Reader:
         ------
         StoreError
         """
+        here = self._start[wanted.start : wanted.stop]
+        if len(here) == wanted.size:
+            return here
+        return here + await self._read(ByteRange(wanted.start + len(here), wanted.stop))
+
+    async def _read(self, wanted: ByteRange) -> bytes:
         try:
             return await self.store.read(wanted)
         except ModelChanged:
             # Hosts behind several edges give one file several tags: look whether it is another build at all.
             self.store.forget()
-            fresh = await open_index(self.store)
+            fresh, _ = await open_index(self.store)
             if fresh.header.digest != self.index.header.digest:
                 raise
             self.store.forget(distrust_tags=True)
             return await self.store.read(wanted)
+
+    def _reject(self, place: ByteRange) -> None:
+        """Note that a range is damaged: neither the store nor what was kept of the opening gives it again."""
+        self._start = self._start[: place.start]
+        self.store.reject(place)
 
     async def _together(self, places: list[ByteRange]) -> list[bytes]:
         """Read ranges at the same time; if one fails the others are cut off."""
@@ -253,7 +270,7 @@ class Reader:
             try:
                 add_page(self.index, page, data)
             except Corrupt:
-                self.store.reject(place)
+                self._reject(place)
                 data = await self.read(place)
             else:
                 break
@@ -273,7 +290,7 @@ class Reader:
             for _ in range(self.options.tries - 1):
                 if not isinstance(clouds[number], Corrupt):
                     break
-                self.store.reject(place)
+                self._reject(place)
                 parts[number] = await self.read(place)
                 clouds[number : number + 1] = await loop.run_in_executor(threads, self._decode, [node], [parts[number]])
             if not isinstance(clouds[number], Corrupt):

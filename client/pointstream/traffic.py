@@ -18,7 +18,7 @@ from lpc.ranges import ByteRange
 from .arrivals import Assembly
 from .build import Build
 from .decoding import Decoder
-from .opening import Opening, add_page, vouch_opening
+from .opening import Opening, add_page, naming, vouch_opening
 from .recovery import Recovery
 from .scheduler import Item, LinkState, Request, Scheduler
 from .stats import ErrorLog, ErrorReport
@@ -169,6 +169,7 @@ class Traffic:
             nonlocal build
             if build is None and opening.look(assembly.data, ended=ended):
                 build = self._begin(opening, assembly.data)
+                assembly.used = opening.needed
                 self._claim(build, request, assembly, np.flatnonzero(build.index.known))
                 if opened is not None:
                     opened.set_result(None)
@@ -186,12 +187,13 @@ class Traffic:
             while build is None:  # the header is larger than the probe
                 await self.store.read(ByteRange(len(assembly.data), opening.needed), sink)
                 look(ended=len(assembly.data) < opening.needed)
+            build.tail = assembly.rest()
             self._recovery.answered()
         except LpcError as error:
             if opened is None or opened.done():
                 self._failed(error)
             else:
-                opened.set_exception(error)
+                opened.set_exception(naming(self.store.name, error))
         finally:
             self._probing = False
             scheduler.ended(request)
@@ -226,10 +228,14 @@ class Traffic:
             self._arrive(build, request, assembly)
 
         try:
-            data = await self.store.read(request.range, sink)
+            wanted = request.range
+            if here := build.take_tail(wanted):
+                assembly.feed(wanted.start, here)
+                wanted = ByteRange(wanted.start + len(here), wanted.stop)
+            data = await self.store.read(wanted, sink)
             self._recovery.answered()
-            if len(data) < request.range.size:
-                build.ends_at(request.range.start + len(data))
+            if len(data) < wanted.size:
+                build.ends_at(wanted.start + len(data))
         except LpcError as error:
             self._failed(error)
         finally:
@@ -290,7 +296,7 @@ class Traffic:
 
     def _damaged(self, build: Build, key: int, error: FormatError) -> None:
         if build.failed(key, self._options.tries):
-            self.errors.add("page" if key < 0 else "cloud", f"{error}; it stays missing")
+            self.errors.add("page" if key < 0 else "cloud", f"{self.store.name}: {error}; it stays missing")
             self.wanted.came(self._clock(), key)
 
     def _failed(self, error: LpcError) -> None:
@@ -299,7 +305,8 @@ class Traffic:
         if isinstance(error, ModelChanged):
             self._reload(now, error)
             return
-        self.errors.add("host" if isinstance(error, StoreError) else "model", str(error))
+        cause = "host" if isinstance(error, StoreError) else "model"
+        self.errors.add(cause, str(naming(self.store.name, error)))
         if isinstance(error, Unavailable):
             self._recovery.failed(now)
         else:
@@ -307,7 +314,7 @@ class Traffic:
 
     def _reload(self, now: float, error: ModelChanged) -> None:
         """Cut off all requests of this build and open what stands there now; this build is drawn until then."""
-        self.errors.add("model", f"{error}; reading it anew")
+        self.errors.add("model", f"{naming(self.store.name, error)}; reading it anew")
         if not self._recovery.may_reload(now):
             self.errors.add("host", f"{self.store.name}: the model changes again and again; the host is inconsistent")
             self._stop(now)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import math
 import os
 import re
 from dataclasses import asdict
@@ -14,10 +13,12 @@ from typing import TYPE_CHECKING, Any, Self
 import click
 
 from lpc.errors import FormatError
+from pointstream.arguments import COUNT, POSITIVE, Number
 from pointstream.cli import CACHE, choose_cache
 
 if TYPE_CHECKING:
     from lpc.header import Header
+    from pointlink.profiles import Profile
     from pointstream.cache import Cache
 
     from .refine import Cut
@@ -72,11 +73,20 @@ class ViewType(click.ParamType[dict[str, Any]]):
         return view
 
 
-def positive(_ctx: click.Context, _param: click.Parameter, value: float) -> float:
-    """Refuse what click's ranges let pass: a NaN is neither below nor above anything."""
-    if not 0 < value < math.inf:
-        raise click.BadParameter(f"{value} is not above 0")
-    return value
+def read_link(text: str) -> Profile:
+    """Read the option ``--link``.
+
+    Raises
+    ------
+    click.BadParameter
+        If it is none.
+    """
+    from pointlink.profiles import parse_profile
+
+    try:
+        return parse_profile(text)
+    except ValueError as error:
+        raise click.BadParameter(str(error), param_hint="--link") from error
 
 
 @click.command()
@@ -86,21 +96,19 @@ def positive(_ctx: click.Context, _param: click.Parameter, value: float) -> floa
 @click.option("--view", type=ViewType(), help="Where to look from; without it the whole model is framed.")
 @click.option(
     "--tolerance",
-    type=float,
-    callback=positive,
+    type=POSITIVE,
     default=1.0,
     show_default=True,
     help="Spacing of samples on the screen that is fine enough, pixels.",
 )
-@click.option("--budget", type=click.IntRange(min=1), help="Most splats; coarser where the tolerance needs more.")
+@click.option("--budget", type=COUNT, help="Most splats; coarser where the tolerance needs more.")
 @click.option("--backend", type=click.Choice(["auto", "gl", "cpu"]), default="auto", show_default=True)
 @click.option("--two-sided", is_flag=True, help="Show surfaces from behind too: for normals that may point inward.")
 @click.option("--path", type=click.Path(path_type=Path, dir_okay=False), help="PATH.json: a picture at each time.")
 @click.option("--turntable", type=click.IntRange(min=2, max=MOST_PICTURES), help="So many pictures around the model.")
 @click.option(
     "--fps",
-    type=click.FloatRange(min=0.1, max=120),
-    callback=positive,
+    type=Number(min=0.1, max=120),
     default=12.0,
     show_default=True,
     help="Pictures a second, of a path or turntable.",

@@ -9,9 +9,10 @@ from typing import Any
 
 import click
 
+from pointstream.arguments import POSITIVE
 from pointstream.cli import CACHE, choose_cache
 
-from .cli import SizeType, ViewType, Waiting, positive
+from .cli import SizeType, ViewType, Waiting, read_link
 
 
 @click.command()
@@ -20,8 +21,7 @@ from .cli import SizeType, ViewType, Waiting, positive
 @click.option("--view", type=ViewType(), help="Where to look from; without it the whole model is framed.")
 @click.option(
     "--tolerance",
-    type=float,
-    callback=positive,
+    type=POSITIVE,
     default=1.0,
     show_default=True,
     help="Spacing of samples on the screen that is fine enough, pixels.",
@@ -43,17 +43,10 @@ def estimate(
     as_json: bool,
 ) -> None:
     """Say how many bytes and seconds a view of MODEL takes to reach a tolerance; reads its index, and no clouds."""
-    from pointlink.profiles import parse_profile
-
     from .estimate import EstimateOptions
     from .estimate import estimate as reckon
 
-    profile = None
-    if link is not None:
-        try:
-            profile = parse_profile(link)
-        except ValueError as error:
-            raise click.BadParameter(str(error), param_hint="--link") from error
+    profile = None if link is None else read_link(link)
     options = EstimateOptions(
         width=size[0], height=size[1], view=view, tolerance=tolerance, two_sided=two_sided, profile=profile
     )

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 @click.option("--cloud-size", default=2048, show_default=True, type=click.IntRange(1, 65535), help="Samples a cloud.")
 @click.option("--memory", default="2G", show_default=True, help="Ceiling on resident memory.")
 @click.option(
-    "--threads", default=0, type=click.IntRange(0), help="Worker threads; default: as many as there are cores."
+    "--threads", default=0, type=click.IntRange(0, 1024), help="Worker threads; default: as many as there are cores."
 )
 @click.option("--position-error", default="auto", show_default=True, metavar="auto|LENGTH",
               help="How far a sample may move; auto: half the spacing.")  # fmt: skip

@@ -6,6 +6,7 @@ import re
 
 from lpc.errors import BuildError
 
+LARGEST = 1 << 60
 _UNITS = {"": 1, "k": 1 << 10, "m": 1 << 20, "g": 1 << 30, "t": 1 << 40}
 
 
@@ -18,6 +19,7 @@ def parse_size(text: str) -> int:
         If it is none of these.
     """
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?)(?:i?b)?\s*", text, re.IGNORECASE)
-    if match is None or not float(match[1]):
+    size = 0.0 if match is None else float(match[1]) * _UNITS[match[2].lower()]
+    if not 1 <= size <= LARGEST:
         raise BuildError(f"{text!r} is not a size: write 2G, 600M or a number of bytes")
-    return int(float(match[1]) * _UNITS[match[2].lower()])
+    return int(size)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import re
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -25,11 +26,21 @@ _SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86_400, "w": 604_800}
 _FACTORS = {"": 1.0, "k": 1e3, "M": 1e6, "G": 1e9}
 
 
+class _Seconds(click.FloatRange):
+    """A range that a NaN is not in; click's own lets it pass."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        seconds = super().convert(value, param, ctx)
+        if math.isnan(seconds):
+            self.fail(f"{value} is no number of seconds", param, ctx)
+        return seconds
+
+
 def _parse_rate(ctx: click.Context, param: click.Parameter, value: str | None) -> float | None:
     if value is None:
         return None
     found = re.fullmatch(r"(\d+(?:\.\d+)?)([kMG]?)", value)
-    if found is None or (rate := float(found[1]) * _FACTORS[found[2]]) < 8000:
+    if found is None or not 8000 <= (rate := float(found[1]) * _FACTORS[found[2]]) <= 1e15:
         raise click.BadParameter(f"{value!r} is no number of bits a second like 20M or 800k, at least 8k", ctx, param)
     return rate
 
@@ -52,11 +63,13 @@ def _parse_duration(ctx: click.Context, param: click.Parameter, value: str) -> i
 @click.option("--token-file", type=_FILE, help="Tokens, one a line; only who shows one may read.")
 @click.option("--sign-key", type=_FILE, help="Key of signed addresses (pointstream sign); only who has one may read.")
 @click.option("--rate", callback=_parse_rate, metavar="BITS", help="Bits a second for one address, 20M for example.")
-@click.option("--connections", default=800, show_default=True, type=click.IntRange(1), help="At a time, in total.")
 @click.option(
-    "--per-address", default=256, show_default=True, type=click.IntRange(1), help="At a time, of one address."
+    "--connections", default=800, show_default=True, type=click.IntRange(1, 1 << 20), help="At a time, in total."
 )
-@click.option("--grace", default=60.0, show_default=True, type=click.FloatRange(0), help="Seconds to end replies in.")
+@click.option(
+    "--per-address", default=256, show_default=True, type=click.IntRange(1, 1 << 20), help="At a time, of one address."
+)
+@click.option("--grace", default=60.0, show_default=True, type=_Seconds(0, 86_400), help="Seconds to end replies in.")
 @click.option(
     "--log", "log", default="text", show_default=True, type=click.Choice(["text", "json"]), help="Of requests."
 )

@@ -92,6 +92,6 @@ def test_nobody_there_ends_with_1_and_one_line() -> None:
     assert result.exit_code == 1
     assert (
         result.stderr.strip()
-        == f"cannot connect to 127.0.0.1:{port} (Connection refused); check the address and that this server runs"
+        == f"Error: cannot connect to 127.0.0.1:{port} (Connection refused); check the address and that this server runs"
     )
     assert result.stdout == ""

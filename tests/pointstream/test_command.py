@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import tomllib
@@ -118,6 +119,15 @@ def test_wrong_arguments_are_status_2(
 ) -> None:
     offer(info=lambda size: None)
     assert command.run(arguments) == 2
+    captured = capsys.readouterr()
+    place = "pointstream info" if arguments[0] == "info" else "pointstream"
+    assert re.fullmatch(rf"pointstream: [^\n]+; see '{place} --help'\n", captured.err)
+    assert captured.out == ""
+
+
+def test_no_command_shows_the_help(offer: Callable[..., None], capsys: pytest.CaptureFixture[str]) -> None:
+    offer(info=lambda size: None)
+    assert command.run([]) == 2
     assert "Usage: pointstream" in capsys.readouterr().err
 
 

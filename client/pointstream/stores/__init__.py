@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from lpc.errors import StoreError
 
 from .base import KeepsNothing, Sink, Store
 from .local import LocalStore
@@ -16,6 +19,9 @@ if TYPE_CHECKING:
     from pointstream.cache import Cache
 
 __all__ = ["KeepsNothing", "LocalStore", "MemoryStore", "Sink", "Store", "is_address", "open_store"]
+
+
+_SCHEME = re.compile(r"[a-z][a-z0-9+.-]+://", re.IGNORECASE)
 
 
 def is_address(target: str) -> bool:
@@ -42,6 +48,8 @@ def open_store(target: str, *, clock: Callable[[], float], cache: Cache | None =
         If the file has the map of a partial copy beside it and is no model.
     """
     if not is_address(target):
+        if _SCHEME.match(target):
+            raise StoreError(f"{target}: only http and https addresses and paths of files work")
         path = Path(target)
         if map_path(path).is_file():
             from .partial import PartialStore

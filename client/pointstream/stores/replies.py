@@ -96,7 +96,7 @@ def judge(status: int, headers: Mapping[str, str], wanted: ByteRange, pins: Pins
     pins : Pins
         What earlier replies said.
     host : str
-        For messages.
+        The address, for messages.
 
     Raises
     ------

@@ -9,7 +9,8 @@ from typing import Any
 
 import click
 
-from pointview.cli import SizeType, ViewType, positive
+from pointstream.arguments import POSITIVE, Number
+from pointview.cli import SizeType, ViewType, read_link
 
 LONGEST = 3600.0
 """Seconds: a run keeps two pictures a second in memory."""
@@ -22,8 +23,7 @@ LONGEST = 3600.0
     "--seconds",
     default=30.0,
     show_default=True,
-    type=click.FloatRange(min=0.1, max=LONGEST),
-    callback=positive,
+    type=Number(min=0.1, max=LONGEST),
     help="Length of the run.",
 )
 @click.option("--report", required=True, type=click.Path(path_type=Path, file_okay=False), help="Folder to write to.")
@@ -35,8 +35,7 @@ LONGEST = 3600.0
     "--tolerance",
     default=1.0,
     show_default=True,
-    type=float,
-    callback=positive,
+    type=POSITIVE,
     help="Spacing of samples on the screen that is fine enough, pixels.",
 )
 @click.option("--priority", default="index", show_default=True, type=click.Choice(["index", "error"]))
@@ -71,7 +70,6 @@ def stream(
     as_json: bool,
 ) -> None:
     """Stream MODEL over a link and report its error against run time."""
-    from pointlink.profiles import parse_profile
     from pointstream.progress import progress
 
     from .experiment import Experiment, run_experiment
@@ -80,10 +78,7 @@ def stream(
 
     if view is not None and path is not None:
         raise click.UsageError("--view and --path exclude each other")
-    try:
-        profile = parse_profile(link)
-    except ValueError as error:
-        raise click.BadParameter(str(error), param_hint="--link") from error
+    profile = read_link(link)
     views = None
     if path is not None:
         views = ViewPath.read(path)
@@ -134,8 +129,7 @@ def stream(
     "--seconds",
     default=30.0,
     show_default=True,
-    type=click.FloatRange(min=1.0, max=LONGEST),
-    callback=positive,
+    type=Number(min=1.0, max=LONGEST),
     help="Length of the run.",
 )
 @click.option("--link", default="adsl", show_default=True, metavar="none|adsl|lan|RATE[,RTT]")
@@ -143,5 +137,6 @@ def demo(out: Path, scan: Path | None, seconds: float, link: str) -> None:
     """Build a model, serve it, stream it over 1.25 Mbit/s: the whole tour."""
     from .demo import tour
 
+    read_link(link)  # a wrong one costs no build
     for line in tour(out, scan=scan, seconds=seconds, link=link):
         click.echo(line)

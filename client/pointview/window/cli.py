@@ -10,8 +10,9 @@ from typing import Any
 
 import click
 
+from pointstream.arguments import COUNT, POSITIVE
 from pointstream.cli import CACHE, choose_cache
-from pointview.cli import MOST_THREADS, SizeType, ViewType, positive
+from pointview.cli import MOST_THREADS, SizeType, ViewType, read_link
 
 
 @click.command()
@@ -20,13 +21,12 @@ from pointview.cli import MOST_THREADS, SizeType, ViewType, positive
 @click.option("--view", type=ViewType(), help="Where to look from first; without it the whole model is framed.")
 @click.option(
     "--tolerance",
-    type=float,
-    callback=positive,
+    type=POSITIVE,
     default=1.0,
     show_default=True,
     help="Spacing of samples on the screen that is fine enough, pixels.",
 )
-@click.option("--budget", type=click.IntRange(min=1), help="Most splats.")
+@click.option("--budget", type=COUNT, help="Most splats.")
 @click.option("--backend", type=click.Choice(["auto", "gl", "cpu"]), default="auto", show_default=True)
 @click.option("--link", metavar="none|adsl|lan|RATE[,RTT]", help="See the model as over this line.")
 @click.option(
@@ -35,9 +35,7 @@ from pointview.cli import MOST_THREADS, SizeType, ViewType, positive
     default=Path(),
     help="Where pictures and recorded paths go; the current directory if not given.",
 )
-@click.option(
-    "--seconds", type=float, callback=lambda c, p, v: v if v is None else positive(c, p, v), help="Close by itself."
-)
+@click.option("--seconds", type=POSITIVE, help="Close by itself.")
 @CACHE
 @click.option("--json", "as_json", is_flag=True, help="Print the figures of the session as one JSON object.")
 def view(
@@ -54,7 +52,6 @@ def view(
     as_json: bool,
 ) -> None:
     """Open a window on MODEL, a path or address of a .lpc file; F1 shows the controls."""
-    from pointlink.profiles import parse_profile
     from pointview.camera import Camera
 
     from .feed import Feed
@@ -63,12 +60,7 @@ def view(
     from .settings import Settings
     from .viewer import Viewer, ViewerOptions
 
-    profile = None
-    if link is not None:
-        try:
-            profile = parse_profile(link)
-        except ValueError as error:
-            raise click.BadParameter(str(error), param_hint="--link") from error
+    profile = None if link is None else read_link(link)
     if view is not None:
         Camera.from_view(view, width=size[0], height=size[1])
     settings = Settings(tolerance=tolerance, help=model is None)
