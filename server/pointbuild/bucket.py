@@ -11,7 +11,7 @@ from numba import njit
 from lpc.octahedral import decode_normals
 
 from .areas import Probing, measure
-from .rows import as_words
+from .rows import as_words, positions
 from .spool import write_all
 from .tree import Tree, grow
 
@@ -143,9 +143,11 @@ def partition(
     rows = np.empty(bucket.count, regions.dtype)
     regions.read(first_row, rows)
     rows, scratch = sort_by_path(rows, cells, bucket)
-    fixed = cells.fixed(rows["xyz"])
+    xyz = positions(rows)
+    fixed = cells.fixed(xyz)
     priority = np.ascontiguousarray(rows["priority"])
-    areas = measure(cells, probing, fixed, rows["xyz"], priority, bucket.depth)
+    areas = measure(cells, probing, fixed, xyz, priority, bucket.depth)
+    del xyz
     tree, owner = grow(cells, fixed, priority, scratch, bucket.depth, thresholds[-1] if above else -1, cloud_size)
     del fixed
     limits = np.array(thresholds, np.uint64)
@@ -183,14 +185,14 @@ def sort_by_path(rows: NDArray[Any], cells: Cells, bucket: Bucket) -> tuple[NDAr
     Rows of equal paths come in any order.
     """
     window = cells.window(bucket.depth, 64 - INDEX_BITS)
-    packed = cells.keys(rows["xyz"], window)
+    packed = cells.keys(positions(rows), window)
     _pack(packed)
     packed.sort()
     order = np.empty(len(rows), np.int32)
     tied = _unpack(packed, order)
     if tied and window.bits == 64 - INDEX_BITS:
         # 42 bits did not tell some apart: the rest of the path does. Rare, so a general sort will do.
-        rest = cells.fixed(rows["xyz"])
+        rest = cells.fixed(positions(rows))
         _sort_ties(packed, order, rest, cells.axes, cells.shifts, bucket.depth + window.bits)
     out = np.empty_like(rows)
     np.take(as_words(rows), order, axis=0, out=as_words(out), mode="clip")  # "raise" would copy once more
@@ -270,7 +272,7 @@ def summarise(
     """Box and sum the normals of runs of rows."""
     box = np.empty((len(first), 6))
     sums, bare = np.zeros((len(first), 3), np.int64), np.zeros(len(first), np.int64)
-    _boxes(rows["xyz"], first, samples, box)
+    _boxes(positions(rows), first, samples, box)
     if normals is not None:
         bits = (len(normals).bit_length() - 1) // 2
         _sum_normals(rows["normal"], normals, bits, first, samples, sums, bare)

@@ -35,6 +35,7 @@ from .journal import as_array, from_array
 from .options import BuildOptions
 from .progress import Progress, Silent
 from .publish import GENERATOR, publish
+from .rows import row_start, whole_words
 from .scatter import Regions
 from .spool import Block, Spool
 from .survey import Survey, columns_of, survey
@@ -176,6 +177,7 @@ def _build(
             Cells.over(found.low, found.high),
             regions,
             found.schema,
+            single=found.single,
             cloud_size=options.cloud_size,
             seed=options.seed,
             bucket_samples=sizes.bucket,
@@ -195,7 +197,15 @@ def _estimate(scan: Scan, *, scratch: Path, options: BuildOptions) -> Scan:
 def _sizes(inputs: Inputs, out: Path, folder: Folder, options: BuildOptions) -> memory.Sizes:
     """Check the disk, and share out the memory."""
     spool_bytes = sum(column.itemsize for column in columns_of(inputs.attributes))
-    row_bytes = -(-(spool_bytes + 8) // 8) * 8  # with a priority, in whole words; codes are never wider than values
+    attribute_bytes = spool_bytes - 24  # codes are never wider than values
     samples = inputs.samples_at_most
-    disk.check_space(samples, folder.path, folder.used_bytes(), out, spool_bytes, row_bytes)
-    return memory.choose_sizes(options, samples, row_bytes, memory.resident_bytes())
+    row_bytes = whole_words(row_start(single=False) + attribute_bytes)
+    sizes = memory.choose_sizes(options, samples, row_bytes, memory.resident_bytes())
+    stored = whole_words(row_start(single=inputs.single) + attribute_bytes)
+    disk.check_space(
+        disk.predict(samples, stored, attribute_bytes, (sizes.threads + 2) * sizes.bucket),
+        folder.path,
+        folder.used_bytes(),
+        out,
+    )
+    return sizes

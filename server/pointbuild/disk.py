@@ -6,6 +6,7 @@ import errno
 import os
 import shutil
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from lpc.errors import BuildError
@@ -13,8 +14,24 @@ from lpc.errors import BuildError
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
-FIXED = 64 << 20
-"""Buckets that are being written back, journals and pages of a small model."""
+FIXED = 1 << 20
+"""Journals and the pages of a small model."""
+
+
+@dataclass(frozen=True, slots=True)
+class Need:
+    """Bytes that a build takes.
+
+    Parameters
+    ----------
+    temporary : int
+        Of all temporary files, the unfinished model included, at the worst moment.
+    model : int
+        Of the model.
+    """
+
+    temporary: int
+    model: int
 
 
 def check_target(out: Path) -> None:
@@ -27,27 +44,29 @@ def check_target(out: Path) -> None:
         raise BuildError(f"the directory {out.parent} cannot be written to")
 
 
-def needed_bytes(samples: int, spool_bytes: int, row_bytes: int) -> tuple[int, int]:
-    """Predict the temporary bytes at the worst moment, and those of the model.
+def predict(samples: int, row_bytes: int, attribute_bytes: int, moving: int) -> Need:
+    """Predict what a build takes of the disk.
 
-    The spool gives way to the rows, and the rows to the model: never are two of them whole. A cloud has less than
-    4 bytes a sample for a position at half the spacing, and attributes take no more than they came with.
+    The spool gives way to the rows, and the rows to the model: never are two of them whole. `moving` rows of buckets
+    that are written back are there twice. A position at half the spacing takes less than 4 bytes of a cloud, and
+    attributes take no more than they came with.
     """
-    model = samples * (4 + max(spool_bytes - 24, 0)) + FIXED
-    return max(samples * row_bytes + model, 2 * model), model
+    model = samples * (4 + attribute_bytes) + FIXED
+    rows = samples * row_bytes
+    spool = samples * (24 + attribute_bytes)
+    return Need(max(spool, rows + min(moving, samples) * row_bytes, rows + model, 2 * model) + FIXED, model)
 
 
-def check_space(samples: int, folder: Path, used: int, out: Path, spool_bytes: int, row_bytes: int) -> None:
-    """Raise BuildError if the disks are too full for so many samples; `used` bytes of the folder can be had again."""
-    temporary, model = needed_bytes(samples, spool_bytes, row_bytes)
-    needs = {folder: temporary - used}
+def check_space(need: Need, folder: Path, used: int, out: Path) -> None:
+    """Raise BuildError if the disks are too full; `used` bytes of the temporary folder can be had again."""
+    needs = {folder: need.temporary - used}
     if folder.stat().st_dev != out.parent.stat().st_dev:
-        needs[out.parent] = model
-    for place, need in needs.items():
+        needs[out.parent] = need.model
+    for place, wanted in needs.items():
         free = free_bytes(place)
-        if need > free:
+        if wanted > free:
             raise BuildError(
-                f"the build needs about {_size(need)} in {place.parent if place == folder else place}, which has "
+                f"the build needs about {_size(wanted)} in {place.parent if place == folder else place}, which has "
                 f"{_size(free)} free: make room, or choose another place for temporary files (--scratch)"
             )
 

@@ -53,6 +53,7 @@ def divide(
     regions: Regions,
     schema: Schema,
     *,
+    single: bool,
     cloud_size: int,
     seed: int,
     bucket_samples: int,
@@ -71,6 +72,8 @@ def divide(
         Gets the rows.
     schema : Schema
         The attributes that rows carry.
+    single : bool
+        Positions are float32 without loss.
     cloud_size, seed : int
         M, and what the priorities hash.
     bucket_samples : int
@@ -86,7 +89,7 @@ def divide(
     most = max(bucket_samples, probing.region)
     plan = _count(spool, cells, most, folder, crew, progress)
     check_piles(plan.buckets)
-    regions.lay_out(row_dtype(schema), [bucket.count for bucket in plan.buckets])
+    regions.lay_out(row_dtype(schema, single=single), [bucket.count for bucket in plan.buckets])
     regions.restore()
     limits = candidate_limits(plan, cloud_size, slack)
     candidates = _scatter(spool, cells, plan, limits, seed, schema, regions, folder, crew, progress)

@@ -20,6 +20,8 @@ from lpc.lattice import quantise
 from lpc.octahedral import decode_normals, encode_normals
 from lpc.page import RECORD
 
+from .rows import positions
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -102,7 +104,7 @@ def encode_run(
         count = int(nodes.run_count[run])
         regions.read(int(nodes.run_first[run]), rows[at : at + count])
         at += count
-    lattice = quantise(rows["xyz"], geometry.origin, geometry.step)
+    lattice = quantise(positions(rows), geometry.origin, geometry.step)
     codes = {attribute.name: rows[attribute.name] for attribute in schema}
     frames = encode_clouds(lattice, codes, bounds, schema, effort=effort)
     shape = (stop - first, int(nodes.depth[first:stop].max()) + 1)

@@ -1,7 +1,7 @@
 """What a build has finished, entry by entry, so that one that was killed goes on from there.
 
-A journal is a file of entries, each a few arrays behind its length and CRC-32. An entry is added when what it tells of
-is in its file; a torn entry at the end, and all after it, was never there.
+A journal is a file of entries, each a few arrays, packed with zstd, behind their length and CRC-32. An entry is added
+when what it tells of is in its file; a torn entry at the end, and all after it, was never there.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import zlib
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import zstandard
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+_LEVEL = 1  # counts of cells are nearly all zeros
 _HEAD = struct.Struct("<QII")  # bytes of the body, its CRC-32, arrays in it
 
 
@@ -48,14 +50,14 @@ class Journal:
         body = io.BytesIO()
         for array in arrays:
             np.lib.format.write_array(body, np.asarray(array), allow_pickle=False)
-        data = body.getvalue()
+        data = zstandard.compress(body.getvalue(), _LEVEL)
         with self._path.open("ab") as file:
             file.write(_HEAD.pack(len(data), zlib.crc32(data), len(arrays)) + data)
         self.entries += 1
 
     def __iter__(self) -> Iterator[list[NDArray[Any]]]:
         for (count, data), _ in self._bodies():
-            body = io.BytesIO(data)
+            body = io.BytesIO(zstandard.decompress(data))
             yield [np.lib.format.read_array(body, allow_pickle=False) for _ in range(count)]
 
     def _bodies(self) -> Iterator[tuple[tuple[int, bytes], int]]:

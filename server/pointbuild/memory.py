@@ -60,7 +60,8 @@ def choose_sizes(options: BuildOptions, samples: int, row_bytes: int, resident: 
     while threads > 1 and room < threads * least_bucket * per_sample + (threads + 2) * LEAST_BLOCK * READ_BYTES:
         threads -= 1
     block = min(room // ((threads + 2) * READ_BYTES), BEST_BLOCK)
-    bucket = min(room // (threads * per_sample), BEST_BUCKET)
+    fair = max(samples // (4 * (threads + 2)), least_bucket)  # buckets that move are on disk twice: a quarter in all
+    bucket = min(room // (threads * per_sample), BEST_BUCKET, fair)
     if block < LEAST_BLOCK or bucket < least_bucket:
         need = held + least_bucket * per_sample + 3 * LEAST_BLOCK * READ_BYTES
         raise BuildError(

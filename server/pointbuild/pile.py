@@ -16,6 +16,7 @@ from lpc.page import COINCIDENT
 
 from .areas import Probing, pile_spacing
 from .bucket import BucketTree, Clouds, summarise
+from .rows import positions
 from .spool import read_all, write_all
 from .tree import TOO_MANY, Tree
 
@@ -70,7 +71,7 @@ def partition_pile(
     """
     taken = _sort_by_priority(first_row, bucket.count, thresholds, most, regions)
     left = bucket.count - int(taken.sum())
-    first = cells.fixed(next(regions.chunks(first_row, 1, 1))["xyz"])
+    first = cells.fixed(positions(next(regions.chunks(first_row, 1, 1))))
     tree = _chain(bucket, left, cloud_size, cells, first[0])
     counts = np.concatenate([taken, tree.samples])
     clouds, at = [], first_row
@@ -85,8 +86,8 @@ def partition_pile(
     used = np.flatnonzero(taken)
     (face,) = cells.faces(first, np.array([bucket.depth]))
     asked = next(regions.chunks(first_row, min(bucket.count, probing.region), probing.region))
-    xyz, priority = np.ascontiguousarray(asked["xyz"]), np.ascontiguousarray(asked["priority"])
-    spacing = pile_spacing(xyz, priority, face, probing, bucket.count)
+    priority = np.ascontiguousarray(asked["priority"])
+    spacing = pile_spacing(positions(asked), priority, face, probing, bucket.count)
     measured = [spacing] if spacing > 0 else []
     area = spacing**2 * bucket.count
     return BucketTree(

@@ -1,7 +1,8 @@
 """A sample as one row of bytes: what the passes after the survey move around.
 
-A row holds the position as it came (float64, so that the final quantisation is as exact as the input), the priority,
-and the attribute codes. Rows are whole 8-byte words, which is how kernels copy them.
+A row holds the priority, the position as it came (float64, or float32 where all of the input is, so that the
+final quantisation is as exact as the input), and the attribute codes. Rows are whole 8-byte words, which is how kernels
+copy them.
 """
 
 from __future__ import annotations
@@ -17,9 +18,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from lpc.attributes import Attribute, Schema
-
-XYZ_WORDS = 3
-PRIORITY_WORD = 3
 
 
 class Rows(Protocol):
@@ -55,17 +53,37 @@ class Rows(Protocol):
         """Remove the files."""
 
 
-def row_dtype(schema: Schema) -> np.dtype[Any]:
-    """Fields ``xyz``, ``priority`` and one per attribute, widest first, padded to whole words."""
-    names, formats, offsets, end = ["xyz", "priority"], ["(3,)<f8", "<u8"], [0, 24], 32
+def row_dtype(schema: Schema, *, single: bool = False) -> np.dtype[Any]:
+    """Fields ``priority``, ``xyz`` and one per attribute, widest first, padded to whole words.
+
+    `single`: positions are float32 without loss.
+    """
+    names, formats, offsets = ["priority", "xyz"], ["<u8", "(3,)<f4" if single else "(3,)<f8"], [0, 8]
+    end = row_start(single)
     for attribute in sorted(schema, key=lambda entry: -entry.code_dtype.itemsize):
         item = attribute.code_dtype
+        end = -(-end // item.itemsize) * item.itemsize
         shape = "" if attribute.components == 1 else f"({attribute.components},)"
         names.append(attribute.name)
         formats.append(f"{shape}<u{item.itemsize}")
         offsets.append(end)
         end += item.itemsize * attribute.components
-    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": -(-end // 8) * 8})
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": whole_words(end)})
+
+
+def row_start(single: bool) -> int:
+    """Bytes of a row before its attributes."""
+    return 20 if single else 32
+
+
+def whole_words(size: int) -> int:
+    """Bytes of the 8-byte words that hold so many bytes."""
+    return -(-size // 8) * 8
+
+
+def positions(rows: NDArray[Any]) -> NDArray[np.float64]:
+    """Positions (n, 3) of rows, as they came."""
+    return rows["xyz"].astype(np.float64, order="C")
 
 
 def fill_rows(

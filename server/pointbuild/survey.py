@@ -49,6 +49,8 @@ class Survey:
         Attributes that turned out to say nothing.
     rejected : dict of str to int
         Dropped records by reason.
+    single : bool
+        All coordinates are float32 numbers.
     """
 
     low: NDArray[np.float64]
@@ -57,6 +59,7 @@ class Survey:
     constants: dict[str, Constant]
     left_out: dict[str, str]
     rejected: dict[str, int]
+    single: bool = False
 
     def to_json(self) -> dict[str, Any]:
         """Give everything as plain values; numbers keep all their bits."""
@@ -66,6 +69,7 @@ class Survey:
             "constants": {name: constant.to_json() for name, constant in self.constants.items()},
             "left_out": self.left_out,
             "rejected": self.rejected,
+            "single": self.single,
         }
 
     @classmethod
@@ -79,6 +83,7 @@ class Survey:
             {name: Constant.from_json(constant) for name, constant in entry["constants"].items()},
             entry["left_out"],
             entry["rejected"],
+            entry["single"],
         )
 
 
@@ -112,11 +117,13 @@ def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Pr
         If no sample is left.
     """
     box = np.array([[np.inf] * 3, [-np.inf] * 3])
+    single = True
     rejected: dict[str, int] = {}
     ranges = {column.name: _Range(column) for column in spool.columns[1:]}
-    for batch, (values, low, high, dropped) in crew.map(_prepare, batches):
+    for batch, (values, low, high, short, dropped) in crew.map(_prepare, batches):
         for reason, count in dropped.items():
             rejected[reason] = rejected.get(reason, 0) + count
+        single = single and short
         np.minimum(box[0], low, out=box[0])
         np.maximum(box[1], high, out=box[1])
         for name, found in ranges.items():
@@ -135,34 +142,36 @@ def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Pr
             constants[name] = verdict
         else:
             left_out[name] = verdict
-    return Survey(box[0], box[1], tuple(schema), constants, left_out, {k: v for k, v in rejected.items() if v})
+    return Survey(box[0], box[1], tuple(schema), constants, left_out, {k: v for k, v in rejected.items() if v}, single)
 
 
-def _prepare(batch: PointBatch) -> tuple[dict[str, NDArray[Any]], NDArray[Any], NDArray[Any], dict[str, int]]:
-    """Give the samples of a batch as columns, their box, and what was dropped."""
+def _prepare(batch: PointBatch) -> tuple[dict[str, NDArray[Any]], NDArray[Any], NDArray[Any], bool, dict[str, int]]:
+    """Give the samples of a batch as columns, their box, whether they are float32 numbers, and what was dropped."""
     dropped: dict[str, int] = {}
     box = np.empty((2, 3))
-    if not _box(batch.xyz, box) or (batch.normal is not None and not np.isfinite(batch.normal).all()):
+    good, single = _box(batch.xyz, box)
+    if not good or (batch.normal is not None and not np.isfinite(batch.normal).all()):
         batch, dropped = finite(batch)
-        _box(batch.xyz, box)
+        _, single = _box(batch.xyz, box)
     values: dict[str, NDArray[Any]] = {"xyz": batch.xyz}
     for name, column in batch.attributes.items():
         values[name] = encode_normals(column, NORMAL_BITS) if name == "normal" else column
-    return values, box[0], box[1], dropped
+    return values, box[0], box[1], single, dropped
 
 
 @njit(cache=True, nogil=True)
 def _box(xyz: Any, box: Any) -> Any:
-    """Fill in the box of (n, 3) positions; whether all are finite."""
-    good = True
+    """Fill in the box of (n, 3) positions; whether all are finite, and whether all are float32 numbers."""
+    good, single = True, True
     for axis in range(3):
         low, high = np.inf, -np.inf
         for i in range(len(xyz)):
             value = xyz[i, axis]
             low, high = min(low, value), max(high, value)
             good &= abs(value) < np.inf  # false for what is not a number
+            single &= float(np.float32(value)) == value
         box[0, axis], box[1, axis] = low, high
-    return good
+    return good, single
 
 
 class _Range:

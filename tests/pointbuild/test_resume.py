@@ -195,17 +195,17 @@ def test_what_was_done_is_not_done_again(
         monkeypatch.setattr(module, name, noted)
 
     noting(pointbuild.build, "survey")
-    for name in ("scatter", "partition"):
+    for name in ("scatter", "_partition_bucket"):
         noting(pointbuild.divide, name)
     noting(pointbuild.publish, "encode_run")
     build_model([scan], tmp_path / "m.lpc", options(), clock=time.monotonic)
     assert digest(tmp_path / "m.lpc") == undisturbed
-    names = {"read": "survey", "scatter": "scatter", "partition": "partition"}
+    names = {"read": "survey", "scatter": "scatter", "partition": "_partition_bucket"}
     assert not {names.get(name) for name in untouched} & set(done)
     if stage == "partition":
         whole = Stages()
         build_model([scan], tmp_path / "n.lpc", options(), whole, clock=time.monotonic)
-        assert done.count("partition") == 2 * len(whole.steps["partition"]) - steps
+        assert done.count("_partition_bucket") == 2 * len(whole.steps["partition"]) - steps
 
 
 @pytest.mark.parametrize("what", ["seed", "scan", "version", "restart", "torn"])
