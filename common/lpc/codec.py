@@ -7,7 +7,9 @@ before anything is allocated, and only `Corrupt` comes out of a bad one.
 from __future__ import annotations
 
 import itertools
+import math
 import threading
+from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal, Protocol
@@ -20,7 +22,17 @@ from .cloud import Cloud
 from .errors import Corrupt
 from .lattice import dequantise
 from .octahedral import decode_normals
-from .payload import MAX_SAMPLES, ORIGIN_LIMIT, Layout, Packed, Unpacked, largest_payload, pack_header, parse_layout
+from .payload import (
+    MAX_SAMPLES,
+    ORIGIN_LIMIT,
+    RAW_BITS,
+    Layout,
+    Packed,
+    Unpacked,
+    largest_payload,
+    pack_header,
+    parse_layout,
+)
 from .points import PointBatch
 
 if TYPE_CHECKING:
@@ -34,8 +46,31 @@ if TYPE_CHECKING:
 Effort = Literal["default", "best", "fast"]
 Engine = Literal["auto", "numpy", "compiled"]
 
-WINDOWS: dict[Effort, int] = {"default": 64, "best": 64, "fast": 16}
-"""Previous samples that predict an attribute: with 16 a cloud takes 0.8 % more and decodes 1.7 times as fast."""
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Limits:
+    """What an effort spends on a cloud.
+
+    Parameters
+    ----------
+    window : int
+        Previous samples that predict an attribute: with 16 a cloud takes 0.8 % more and decodes 1.7 times as fast.
+    hard : float
+        Bits a sample of position and normal above which planes are tried.
+    gain : float
+        Bits a sample that planes must save to be kept: a cloud with planes takes twice as long to decode.
+    """
+
+    window: int
+    hard: float
+    gain: float
+
+
+LIMITS: dict[Effort, _Limits] = {
+    "default": _Limits(window=64, hard=20.5, gain=0.25),
+    "best": _Limits(window=64, hard=0.0, gain=0.0),
+    "fast": _Limits(window=16, hard=math.inf, gain=0.0),
+}
 
 ZSTD_MAGIC = bytes.fromhex("28b52ffd")
 MAX_FRAME_WINDOW = 1 << 27
@@ -53,6 +88,7 @@ class _Codec(Protocol):
         end: int,
         channels: Channels,
         window: int,
+        planes: bool = False,
     ) -> Packed: ...
 
     def decode(self, payload: bytes, layout: Layout, channels: Channels) -> Unpacked: ...
@@ -118,7 +154,10 @@ def encode_cloud(
     schema : Schema
         The attributes that are written, in that order.
     effort : {"default", "best", "fast"}
-        "fast" looks at fewer neighbours, for 0.8 % more bytes; "best" lets zstd search longer, for at most 0.3 % less.
+        Normals predicted by planes take about 0.7 bits a sample less, but such a cloud takes twice as long to decode
+        and four times as long to encode. "best" tries planes on every cloud and lets zstd search longer. "default"
+        tries them where position and normal take more than 20.5 bits a sample, and keeps them where they save 0.25.
+        "fast" never tries them and looks at fewer neighbours (docs/format.md, Choices of a writer).
 
     Returns
     -------
@@ -156,26 +195,42 @@ def encode_clouds(
         raise ValueError("lattice coordinates must stay below 2**52")
     rows = to_channels(codes, schema, len(lattice))
     encode = _codec(engine).encode
-    window = WINDOWS[effort]
+    limits = LIMITS[effort]
     compressor = _contexts.compressor(effort)
-    return [
-        _frame(encode(lattice, rows, begin, end, channels, window), channels, compressor)
-        for begin, end in itertools.pairwise(edges)
-    ]
+    frames = []
+    for begin, end in itertools.pairwise(edges):
+        frame, bits = _frame(encode(lattice, rows, begin, end, channels, limits.window), channels, compressor)
+        if len(channels.normals) and bits > limits.hard * (end - begin):
+            packed = encode(lattice, rows, begin, end, channels, limits.window, planes=True)
+            if packed.grid:
+                other, _ = _frame(packed, channels, compressor)
+                if 8 * (len(frame) - len(other)) > limits.gain * (end - begin):
+                    frame = other
+        frames.append(frame)
+    return frames
 
 
-def _frame(packed: Packed, channels: Channels, compressor: zstandard.ZstdCompressor) -> bytes:
-    """Compress a payload with a block for each kind of number, so that each has Huffman codes of its own."""
+def _frame(packed: Packed, channels: Channels, compressor: zstandard.ZstdCompressor) -> tuple[bytes, int]:
+    """Compress a payload with a block for each kind of number, so that each has Huffman codes of its own.
+
+    Returns the frame, and the bits of it that are not other channels than normals.
+    """
     if packed.nbits > 16 or packed.shift > 32:
         raise ValueError(f"a cloud spans 2**{packed.nbits + packed.shift} steps, 2**48 are the most")
     head = pack_header(packed) + packed.raw.tobytes()
     stream = compressor.compressobj(size=len(head) + packed.tokens.size)
-    out = [stream.compress(head)]
-    for first, stop in ((-1, 0), *channels.groups):
-        out.append(stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK))
-        out.append(stream.compress(packed.tokens[1 + first : 1 + stop].data))
-    out.append(stream.flush(zstandard.COMPRESSOBJ_FLUSH_FINISH))
-    return b"".join(out)
+    parts = [stream.compress(head) + stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)]
+    runs = ((-1, 0), *channels.groups)
+    normal = {first for first, _ in channels.normals.tolist()} | {-1}
+    others = 0
+    for first, stop in runs:
+        tokens = packed.tokens[1 + first : 1 + stop]
+        end = zstandard.COMPRESSOBJ_FLUSH_FINISH if stop == len(channels) else zstandard.COMPRESSOBJ_FLUSH_BLOCK
+        parts.append(stream.compress(tokens.data) + stream.flush(end))
+        if first not in normal:
+            others += 8 * len(parts[-1]) + int(RAW_BITS[tokens].sum(dtype=np.int64))
+    frame = b"".join(parts)
+    return frame, 8 * len(frame) - others
 
 
 def decode_cloud(frame: bytes, *, samples: int, schema: Schema, engine: Engine = "auto") -> Cloud:

@@ -33,9 +33,15 @@ _EXACT_FLOATS = {"nnan", "nsz"}
 
 
 def encode(
-    lattice: NDArray[np.int64], rows: NDArray[np.uint32], begin: int, end: int, channels: Channels, window: int
+    lattice: NDArray[np.int64],
+    rows: NDArray[np.uint32],
+    begin: int,
+    end: int,
+    channels: Channels,
+    window: int,
+    planes: bool = False,
 ) -> Packed:
-    """Pack the samples begin to end; see `codec.encode_cloud`."""
+    """Pack the samples begin to end, normals predicted by planes if that is asked for and worth it."""
     rotation, nbits, shift, corner, code, order = _arrange(lattice, rows, begin, end)
     k = end - begin
     position = np.empty((k, 3), np.uint16)
@@ -48,15 +54,18 @@ def encode(
         _predecessors(position, window, before)
     if len(channels.normals):
         turn, least, turned = best_turn(sorted_rows, before, channels)
-        near, back = plane_window(window, channels), before
-        if near != window:
-            back = np.empty(k, np.int64)
-            _predecessors(position, near, back)
-        grid, plane_turn, cost, residuals = best_planes(position, sorted_rows, back, channels, turn)
-        if grid and 64 * cost < 63 * least:  # planes take time
+        if planes:
+            near, back = plane_window(window, channels), before
+            if near != window:
+                back = np.empty(k, np.int64)
+                _predecessors(position, near, back)
+            grid, plane_turn, cost, residuals = best_planes(position, sorted_rows, back, channels, turn)
+            if not grid or cost >= least:
+                grid, residuals = 0, residuals[:0]
+        if grid:
             window, turn = near, plane_turn
         else:
-            grid, residuals, sorted_rows = 0, residuals[:0], turned
+            sorted_rows = turned
     raw, tokens = _pack(
         lattice, corner, shift, 3 * nbits, order, code, sorted_rows, before, channels.bits, channels.start,
         channels.normals, residuals,
@@ -237,9 +246,9 @@ def _predecessors(position: Any, window: int, before: Any) -> None:
     if window == 64:  # a constant trip count is faster
         for i in range(k):
             before[i] = _nearest(xs, ys, zs, i, 64)
-    elif window == 32:
+    elif window == 40:
         for i in range(k):
-            before[i] = _nearest(xs, ys, zs, i, 32)
+            before[i] = _nearest(xs, ys, zs, i, 40)
     elif window == 16:
         for i in range(k):
             before[i] = _nearest(xs, ys, zs, i, 16)

@@ -25,9 +25,15 @@ _GATHER = ((2, 0x0C30C30C30C3), (4, 0x00F00F00F00F), (8, 0x0000FF0000FF), (16, 0
 
 
 def encode(
-    lattice: NDArray[np.int64], rows: NDArray[np.uint32], begin: int, end: int, channels: Channels, window: int
+    lattice: NDArray[np.int64],
+    rows: NDArray[np.uint32],
+    begin: int,
+    end: int,
+    channels: Channels,
+    window: int,
+    planes: bool = False,
 ) -> Packed:
-    """Pack the samples begin to end; see `codec.encode_cloud`."""
+    """Pack the samples begin to end, normals predicted by planes if that is asked for and worth it."""
     points, rows = lattice[begin:end], rows[:, begin:end]
     corner = points.min(axis=0)
     local = points - corner
@@ -49,14 +55,17 @@ def encode(
     residuals = np.empty((0, len(code)), np.uint32)
     if len(channels.normals):
         turn, least, turned = best_turn(rows, before, channels)
-        near = plane_window(window, channels)
-        grid, plane_turn, cost, residuals = best_planes(
-            top.astype(np.uint16), rows, _nearest(top, near), channels, turn
-        )
-        if grid and 64 * cost < 63 * least:  # planes take time
+        if planes:
+            near = plane_window(window, channels)
+            grid, plane_turn, cost, residuals = best_planes(
+                top.astype(np.uint16), rows, _nearest(top, near), channels, turn
+            )
+            if cost >= least:
+                grid = 0
+        if grid:
             window, turn = near, plane_turn
         else:
-            grid, rows = 0, turned
+            rows = turned
     channel_numbers = [_zigzag(rows[row], before, channels, row) for row in range(len(channels))]
     if grid:
         for row, residual in zip(channels.normal_rows.tolist(), residuals, strict=True):

@@ -19,8 +19,12 @@ if TYPE_CHECKING:
 MAX_BITS = 48
 """A coordinate has 16 bits and at most 32 low bits."""
 
-SLACK = 0.99
-"""Of the bound that the step uses: the rest is for float32 arithmetic in shaders, 0.004 of a step."""
+SLACK = 0.999
+"""Of the bound that the step uses: the rest is for the rounding of float64, however far from the origin a model lies.
+
+The bound is of what a reader decodes, in float64. A renderer that places splats in float32 adds its own rounding,
+0.004 of a step, to a splat that is 1.7 steps wide or more.
+"""
 
 EPSILON = 2.0**-52
 

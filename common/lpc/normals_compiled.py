@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 KEPT = 20
 """Bits that matrices and vectors are cut to: products of two, and sums of three of them, stay below 2**53."""
-EVERY = 4
-"""One sample in so many tells how well a grid suits."""
 
 
 def best_turn(
@@ -66,7 +64,7 @@ def from_planes(
 ) -> None:
     """Turn residuals of normals, signed in uint32, into codes that are still turned, in place."""
     normal = np.empty((len(position), 3), np.int64)
-    _planes(position, grid, table_bits(len(position)), 1, normal)
+    _planes(position, grid, table_bits(len(position)), normal)
     for first, centre in channels.normals.tolist():
         _add_planes(normal, before, rows[first], rows[first + 1], int(channels.bits[first]), centre, turn)
 
@@ -209,47 +207,54 @@ def _least_axis(xx: Any, yy: Any, zz: Any, xy: Any, xz: Any, yz: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _planes(position: Any, grid: int, table: int, every: int, normal: Any) -> None:
-    """Directions of the planes of samples 0, every, 2 every, ...: sums go to the nodes of a grid and come back."""
-    k = len(position)
+def _nodes_around(position: Any, grid: int, table: int, around: Any, weight: Any, own: Any) -> int:
+    """Fill in the nodes around each sample, its weights there and its terms of the sums; returns how many nodes."""
     mask = (np.int64(1) << table) - 1
     slot = np.full(1 << (3 * table), -1, np.int32)
     used = 0
-    node = np.empty((min(8 * k, 1 << (3 * table)), 10), np.int64)
-    around = np.empty((k, 8), np.int32)
-    weight = np.empty((k, 8), np.int64)
     shift, factor = grid >> 2, 32 * (7 - (grid & 3))
-    for i in range(k):
+    for i in range(len(position)):
         x = (np.int64(position[i, 0]) * factor) >> shift
         y = (np.int64(position[i, 1]) * factor) >> shift
         z = (np.int64(position[i, 2]) * factor) >> shift
         near_x, near_y, near_z = ((x & 31) + 2) >> 2, ((y & 31) + 2) >> 2, ((z & 31) + 2) >> 2
+        own[i, 0], own[i, 1], own[i, 2], own[i, 3] = 1, x, y, z
+        own[i, 4], own[i, 5], own[i, 6], own[i, 7], own[i, 8], own[i, 9] = x * x, y * y, z * z, x * y, x * z, y * z
         for corner in range(8):
             a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
-            w = (near_x if a else 8 - near_x) * (near_y if b else 8 - near_y) * (near_z if c else 8 - near_z)
             key = (((x >> 5) + a) & mask) | ((((y >> 5) + b) & mask) << table)
             key |= (((z >> 5) + c) & mask) << (2 * table)
             at = slot[key]
             if at < 0:
                 at = used
                 slot[key] = used
-                node[at] = 0
                 used += 1
             around[i, corner] = at
-            weight[i, corner] = w
-            wx, wy, wz = w * x, w * y, w * z
-            sums = node[at]
-            sums[0] += w
-            sums[1] += wx
-            sums[2] += wy
-            sums[3] += wz
-            sums[4] += wx * x
-            sums[5] += wy * y
-            sums[6] += wz * z
-            sums[7] += wx * y
-            sums[8] += wx * z
-            sums[9] += wy * z
-    for i in range(0, k, every):
+            weight[i, corner] = (
+                (near_x if a else 8 - near_x) * (near_y if b else 8 - near_y) * (near_z if c else 8 - near_z)
+            )
+    return used
+
+
+@njit(cache=True, nogil=True)
+def _spread(around: Any, weight: Any, own: Any, node: Any) -> None:
+    """Add what the samples have to their nodes. A loop of nothing else is one that the compiler turns into vectors."""
+    for i in range(len(own)):
+        for corner in range(8):
+            at, w = around[i, corner], weight[i, corner]
+            for which in range(10):
+                node[at, which] += w * own[i, which]
+
+
+@njit(cache=True, nogil=True)
+def _planes(position: Any, grid: int, table: int, normal: Any) -> None:
+    """Directions of the planes of samples: sums go to the nodes of a grid and come back."""
+    k = len(position)
+    around, weight = np.empty((k, 8), np.int32), np.empty((k, 8), np.int64)
+    own = np.empty((k, 10), np.int64)
+    node = np.zeros((_nodes_around(position, grid, table, around, weight, own), 10), np.int64)
+    _spread(around, weight, own, node)
+    for i in range(k):
         s = x = y = z = xx = yy = zz = xy = xz = yz = np.int64(0)
         for corner in range(8):
             w, sums = weight[i, corner], node[around[i, corner]]
@@ -333,12 +338,12 @@ def _add_planes(normal: Any, before: Any, first: Any, second: Any, bits: int, ce
 
 @njit(cache=True, nogil=True)
 def _planes_cost(normal: Any, rows: Any, before: Any, bits: Any, normals: Any, turn: int) -> Any:
-    """Bits of the residuals of samples 0, EVERY, 2 EVERY, ... where planes predict normals; nothing is carried."""
+    """Bits of the residuals where planes predict normals; nothing is carried."""
     cost = np.int64(0)
     for m in range(len(normals)):
         row, centre = normals[m]
         first, second = rows[row], rows[row + 1]
-        for i in range(0, len(before), EVERY):
+        for i in range(len(before)):
             u, v = _guess(normal, i, before[i], first, second, centre, turn)
             cost += _size(np.int64(first[i]) - u, bits[row])
             cost += _size(np.int64(second[i]) - v, bits[row])
@@ -395,12 +400,12 @@ def _best_planes(
         row, centre = normals[m]
         _turn(rows[row], rows[row + 1], centre, turn, turned[row], turned[row + 1])
     best = _first_grid(position, before)
-    _planes(position, best, table, EVERY, normal)
+    _planes(position, best, table, normal)
     least = _planes_cost(normal, turned, before, bits, normals, turn)
     for step in (1, -1):
         begin = best
         while FIRST_GRID <= best + step <= LAST_GRID:
-            _planes(position, best + step, table, EVERY, normal)
+            _planes(position, best + step, table, normal)
             cost = _planes_cost(normal, turned, before, bits, normals, turn)
             if cost >= least:
                 break
@@ -408,7 +413,7 @@ def _best_planes(
         if best != begin:
             break
 
-    _planes(position, best, table, 1, normal)
+    _planes(position, best, table, normal)
     best_turn = _best_turn_of_planes(normal, rows, before, bits, normals, turned)
     cost = np.int64(0)
     for m in range(len(normals)):

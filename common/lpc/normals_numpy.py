@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 KEPT = 20
 """Bits that matrices and vectors are cut to: products of two, and sums of three of them, stay below 2**53."""
-EVERY = 4
-"""One sample in so many tells how well a grid suits."""
 
 _PRODUCTS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 _COMPOSED = np.array(
@@ -75,11 +73,9 @@ def best_planes(
     turned = _turn(rows, channels, turn)
 
     def cost(grid: int) -> int:
-        every = slice(None, None, EVERY)
         normal = _planes(position, grid)
         return sum(
-            int(_size(residual)[:, every].sum())
-            for residual in _residuals(normal, turned, turned, before, channels, turn)
+            int(_size(residual).sum()) for residual in _residuals(normal, turned, turned, before, channels, turn)
         )
 
     best = _first_grid(position, before)
@@ -198,8 +194,8 @@ def _cut(values: Signed) -> Signed:
 
 def _bit_length(number: Signed) -> Signed:
     """Bits of numbers below 2**63."""
-    wide = np.where(number >> 52, 12, 0)  # a float holds 53 bits
-    return np.frexp((number >> wide).astype(np.float64))[1] + wide
+    top = (number & ~(number >> 1)).astype(np.float64)  # without the bit below the top one nothing is rounded up
+    return (top.view(np.int64) >> 52) - 1022  # far below 0 for 0
 
 
 def _points(normal: Signed, centre: int) -> Signed:

@@ -118,6 +118,8 @@ def max_error_degrees(bits: int) -> float:
 
 def _sign(value: NDArray[Any]) -> NDArray[Any]:
     """-1 or 1; 1 for both zeros."""
+    if value.dtype.kind == "i":  # shifts are three times as fast
+        return (value >> (8 * value.dtype.itemsize - 1)) | value.dtype.type(1)
     return np.where(value >= 0, value.dtype.type(1), value.dtype.type(-1))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,10 @@ from oracles.cloud import directions, read_cloud
 from lpc import codec_compiled, codec_numpy, normals_compiled, normals_numpy
 from lpc.attributes import Attribute
 from lpc.channels import channels_of, to_channels
-from lpc.codec import decode_cloud, encode_cloud
+from lpc.codec import LIMITS, decode_cloud, encode_cloud
 from lpc.errors import Corrupt
 from lpc.octahedral import encode_normals
-from lpc.payload import FIRST_GRID, LAST_GRID, pack_header, parse_layout, table_bits
+from lpc.payload import FIRST_GRID, LAST_GRID, MAX_GRID_SAMPLES, pack_header, parse_layout, table_bits
 
 NORMAL = Attribute(name="normal", kind="normal", dtype="<f4", bits=8)
 GRID_AT, WINDOW_AT = 7, 4
@@ -39,9 +40,9 @@ def bumpy_sphere(samples: int, seed: int, radius: float = 60.0, bits: int = 8) -
     return np.rint(radius * bumps[:, None] * unit).astype(np.int64), encode_normals(normals, bits)
 
 
-def both(lattice: Any, codes: Any, schema: Any = (NORMAL,)) -> bytes:
+def both(lattice: Any, codes: Any, schema: Any = (NORMAL,), effort: Any = "default") -> bytes:
     """A frame, after both engines have made it and read it back."""
-    frames = [encode_cloud(lattice, codes, schema, engine=engine) for engine in ("compiled", "numpy")]
+    frames = [encode_cloud(lattice, codes, schema, engine=engine, effort=effort) for engine in ("compiled", "numpy")]
     assert frames[0] == frames[1]
     clouds = [
         decode_cloud(frames[0], samples=len(lattice), schema=schema, engine=engine) for engine in ("compiled", "numpy")
@@ -57,7 +58,7 @@ def both(lattice: Any, codes: Any, schema: Any = (NORMAL,)) -> bytes:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_surface_is_predicted_by_planes_and_a_reader_of_the_specification_agrees(seed: int) -> None:
     lattice, normals = bumpy_sphere(900, seed)
-    frame = both(lattice, {"normal": normals})
+    frame = both(lattice, {"normal": normals}, effort="best")
     assert FIRST_GRID <= payload_of(frame)[GRID_AT] <= LAST_GRID
     told = read_cloud(frame, 900, [NORMAL.to_json()])
     cloud = decode_cloud(frame, samples=900, schema=(NORMAL,))
@@ -68,21 +69,48 @@ def test_a_surface_is_predicted_by_planes_and_a_reader_of_the_specification_agre
 def test_planes_take_bits_off_a_surface_and_never_add_any_to_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     lattice, normals = bumpy_sphere(2048, 7)
     noise = encode_normals(np.random.default_rng(1).normal(size=(2048, 3)))
-    with_planes = both(lattice, {"normal": normals})
+    with_planes = both(lattice, {"normal": normals}, effort="best")
     with_noise = both(lattice, {"normal": noise})
     monkeypatch.setattr(codec_compiled, "best_planes", lambda *_: (0, 0, 0, np.empty((2, 2048), np.uint32)))
-    without = encode_cloud(lattice, {"normal": normals}, (NORMAL,))
+    without = encode_cloud(lattice, {"normal": normals}, (NORMAL,), effort="best")
     assert payload_of(without)[GRID_AT] == 0
     assert 8 * (len(without) - len(with_planes)) / 2048 > 1.0
     assert payload_of(with_noise)[GRID_AT] == 0
     assert with_noise == encode_cloud(lattice, {"normal": noise}, (NORMAL,))
 
 
+def test_default_tries_planes_where_a_cloud_is_hard_and_fast_never_does() -> None:
+    easy, hard = bumpy_sphere(2048, 7, radius=40.0), bumpy_sphere(2048, 7, radius=400.0)
+    grids = {}
+    for name, (lattice, normals) in (("easy", easy), ("hard", hard)):
+        for effort in ("default", "best", "fast"):
+            frame = both(lattice, {"normal": normals}, effort=effort)
+            grids[name, effort] = payload_of(frame)[GRID_AT] > 0
+            if effort == "default" and name == "easy":
+                assert 8 * len(frame) <= LIMITS["default"].hard * 2048
+    assert {key for key, used in grids.items() if used} == {("easy", "best"), ("hard", "best"), ("hard", "default")}
+
+
+def test_what_other_channels_take_makes_no_cloud_hard() -> None:
+    schema = (NORMAL, Attribute(name="color", kind="color", dtype="|u1", bits=8))
+    lattice, normals = bumpy_sphere(2048, 7, radius=40.0)
+    colors = np.random.default_rng(5).integers(0, 256, (2048, 3), np.uint8)
+    frame = both(lattice, {"normal": normals, "color": colors}, schema)
+    assert 8 * len(frame) > LIMITS["default"].hard * 2048
+    assert payload_of(frame)[GRID_AT] == 0
+
+
+def test_planes_that_save_too_little_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    lattice, normals = bumpy_sphere(2048, 7, radius=400.0)
+    monkeypatch.setitem(LIMITS, "default", replace(LIMITS["default"], gain=8.0))
+    assert payload_of(encode_cloud(lattice, {"normal": normals}, (NORMAL,)))[GRID_AT] == 0
+
+
 @pytest.mark.parametrize("bits", [2, 5, 12, 16])
 def test_normals_of_any_width(bits: int) -> None:
     schema = (Attribute(name="normal", kind="normal", dtype="<f4", bits=bits),)
     lattice, normals = bumpy_sphere(500, 3, bits=bits)
-    frame = both(lattice, {"normal": normals}, schema)
+    frame = both(lattice, {"normal": normals}, schema, effort="best")
     told = read_cloud(frame, 500, [schema[0].to_json()])
     found = decode_cloud(frame, samples=500, schema=schema).codes["normal"]
     assert found.tolist() == [list(pair) for pair in told["normal"]]
@@ -104,7 +132,7 @@ def test_two_normals_and_other_channels_beside_them() -> None:
         "time": rng.integers(0, 1 << 40, 700, np.uint64),
         "inward": inward,
     }
-    frame = both(lattice, codes, schema)
+    frame = both(lattice, codes, schema, effort="best")
     payload = payload_of(frame)
     assert payload[GRID_AT] > 0
     assert payload[WINDOW_AT] == 64  # colours want more samples to choose from
@@ -148,7 +176,7 @@ def test_planes_of_crowds_wrap_alike(samples: int) -> None:
     position[: samples // 2] += np.uint16(2**16 - 4)
     for grid in (FIRST_GRID, 30, LAST_GRID):
         compiled = np.empty((samples, 3), np.int64)
-        normals_compiled._planes(position, grid, table_bits(samples), 1, compiled)
+        normals_compiled._planes(position, grid, table_bits(samples), compiled)
         np.testing.assert_array_equal(normals_numpy._planes(position, grid).T, compiled)
         if samples <= 500:
             assert compiled.tolist() == directions(position.astype(int).tolist(), grid)
@@ -178,3 +206,13 @@ def test_a_grid_out_of_range_is_corrupt(grid: int) -> None:
 )
 def test_tables_have_room(samples: int, bits: int) -> None:
     assert table_bits(samples) == bits
+
+
+def test_a_cloud_too_large_for_planes_has_none() -> None:
+    lattice, normals = bumpy_sphere(MAX_GRID_SAMPLES + 1, 8, radius=4000.0)
+    frame = encode_cloud(lattice, {"normal": normals}, (NORMAL,), effort="best", engine="compiled")
+    assert payload_of(frame)[GRID_AT] == 0
+    found = decode_cloud(frame, samples=len(lattice), schema=(NORMAL,))
+    key = np.column_stack([found.lattice(), found.codes["normal"]])
+    wanted = np.column_stack([lattice, normals])
+    np.testing.assert_array_equal(key[np.lexsort(key.T)], wanted[np.lexsort(wanted.T)])

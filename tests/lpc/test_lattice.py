@@ -32,8 +32,14 @@ def test_bits_of_the_paper_by_its_words() -> None:
 
 def test_step_from_the_spacing_keeps_the_error_under_half_of_it() -> None:
     step = position_step(2.0, 1000.0)
-    assert step == pytest.approx(0.99 * 2.0 / 3**0.5)
+    assert step == pytest.approx(0.999 * 2.0 / 3**0.5)
     assert position_error_bound(step, np.zeros(3), 1000.0) < 1.0
+
+
+@given(st.floats(1e-3, 10.0), st.floats(1.0, 1e5), st.floats(0.0, 1e7))
+def test_rounding_stays_inside_the_slack(spacing: float, extent: float, away: float) -> None:
+    step = position_step(spacing, extent)
+    assert position_error_bound(step, np.array([away, -away, 0.0]), extent) < spacing / 2
 
 
 def test_step_from_a_bound() -> None:
