@@ -18,7 +18,7 @@ Nothing here does I/O or reads a clock; equal arguments give equal cuts.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -115,13 +115,20 @@ class _Sieve:
     frustum: int = 0
     backface: int = 0
     occluded: int = 0
+    eye: NDArray[np.float64] = field(init=False)
+    planes: NDArray[np.float64] = field(init=False)
+    focal: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        camera = self.camera  # once, and not for every level
+        self.eye, self.planes, self.focal = np.array(camera.eye), camera.frustum_planes().T, camera.focal
 
     def look(self, nodes: Nodes) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
         """Return which nodes are visible, and the projected spacing of all, pixels."""
         index = self.index
         radius = index.radius[nodes]
-        offset = index.center[nodes] - np.array(self.camera.eye)
-        visible = np.min(offset @ self.camera.frustum_planes().T, axis=1) >= -radius
+        offset = index.center[nodes] - self.eye
+        visible = np.min(offset @ self.planes, axis=1) >= -radius
         self.frustum += len(nodes) - int(np.count_nonzero(visible))
         distance = np.sqrt(np.einsum("ij,ij->i", offset, offset))
         gap = distance - radius
@@ -139,7 +146,7 @@ class _Sieve:
             visible &= ~away
         visible &= self.uncovered(nodes, visible)
         spacing_px = np.full(len(nodes), np.inf)
-        np.divide(index.spacing[nodes] * self.camera.focal, gap, out=spacing_px, where=outside)
+        np.divide(index.spacing[nodes] * self.focal, gap, out=spacing_px, where=outside)
         return visible, spacing_px
 
     def uncovered(self, nodes: Nodes, among: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -237,7 +244,7 @@ def refine(
     splat_px = np.ones(len(nodes))
     grown = spacing > 0
     splat_px[grown] = CLOSING * spacing_px[grown] * (spacing[grown] / index.spacing[nodes[grown]])
-    wants, pages = _missing(index, camera, levels, priority)
+    wants, pages = _missing(index, camera, tolerance, levels, priority)
     return Cut(
         nodes=nodes,
         spacing=spacing.astype(np.float32),
@@ -297,7 +304,9 @@ def _shown_spacing(levels: list[_Level], spacings: list[NDArray[np.float64]]) ->
     return shown[::-1]
 
 
-def _missing(index: IndexTree, camera: Camera, levels: list[_Level], priority: Priority) -> tuple[Nodes, Nodes]:
+def _missing(
+    index: IndexTree, camera: Camera, tolerance: float, levels: list[_Level], priority: Priority
+) -> tuple[Nodes, Nodes]:
     """Wanted nodes and wanted pages, most urgent first."""
     nodes = np.concatenate([level.children[level.missing] for level in levels])
     if len(nodes) == 0:
@@ -305,24 +314,34 @@ def _missing(index: IndexTree, camera: Camera, levels: list[_Level], priority: P
     if priority == "error":
         shown_px = np.concatenate([np.repeat(level.spacing_px, 2).reshape(-1, 2)[level.missing] for level in levels])
         child_px = np.concatenate([level.child_spacing_px[level.missing] for level in levels])
-        nodes = nodes[np.lexsort((nodes, -_error_per_byte(index, camera, nodes, shown_px, child_px)))]
+        nodes = nodes[np.lexsort((nodes, -_error_per_byte(index, camera, tolerance, nodes, shown_px, child_px)))]
     pages = nodes[~index.known[nodes]] // index.header.page_nodes
     _, first = np.unique(pages, return_index=True)
     return nodes, pages[np.sort(first)]
 
 
 def _error_per_byte(
-    index: IndexTree, camera: Camera, nodes: Nodes, shown_px: NDArray[np.float64], child_px: NDArray[np.float64]
+    index: IndexTree,
+    camera: Camera,
+    tolerance: float,
+    nodes: Nodes,
+    shown_px: NDArray[np.float64],
+    child_px: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Screen error that fetching a node removes, per byte: projected spacing times projected area.
+    """Screen error that fetching a node removes, per byte: projected spacing over tolerance, times visible area.
 
-    Unknown nodes come first (infinite): their page costs little and hides what else is wanted.
+    The area is that of the node's samples, one spacing squared each, as it is seen from the eye: less where the
+    normals lean away. Unknown nodes come first (infinite): their page costs little and hides what else is wanted.
     """
     largest = float(max(camera.width, camera.height))
-    distance = np.linalg.norm(index.center[nodes] - np.array(camera.eye), axis=1)
-    radius_px = np.minimum(index.radius[nodes] * camera.focal / np.maximum(distance, 1e-300), largest)
-    removed = np.minimum(shown_px, largest) - np.minimum(child_px, largest)
-    score = np.maximum(removed, 0.0) * radius_px**2 / np.maximum(index.size[nodes], 1)
+    offset = index.center[nodes] - np.array(camera.eye)
+    distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-300)
+    toward = -np.einsum("ij,ij->i", index.cone_axis[nodes], offset) / distance
+    facing = np.where(index.cone_angle[nodes] < np.pi, np.maximum(toward, 0.1), 0.5)
+    fine = np.clip(child_px, tolerance, largest)
+    removed = np.maximum(np.minimum(shown_px, largest) - fine, 0.0) / tolerance
+    area = index.samples[nodes] * np.minimum(index.spacing[nodes] * camera.focal / distance, largest) ** 2 * facing
+    score = removed * area / np.maximum(index.size[nodes], 1)
     return np.where(index.known[nodes], score, np.inf)
 
 

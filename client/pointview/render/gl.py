@@ -47,7 +47,16 @@ COMMAND = np.dtype([(name, "<u4") for name in ("count", "instances", "first", "b
 """glMultiDrawArraysIndirect's command, padded: moderngl steps 20 bytes from one to the next."""
 
 PLACEMENT = np.dtype(
-    [("offset", "<f4", 3), ("placement", "<f4", 2), ("corner", "<f4", 3), ("node", "<i4"), ("place", "<i4", 2)]
+    [
+        ("offset", "<f4", 3),
+        ("scale", "<f4"),
+        ("corner", "<f4", 3),
+        ("side", "<f4"),
+        ("node", "<i4"),
+        ("row", "<i4"),
+        ("level", "<i4"),
+        ("padding", "<i4"),
+    ]
 )
 """What a draw of one cloud is told; see the vertex shader."""
 
@@ -131,7 +140,7 @@ class GlBackend:
         if self._one_draw:
             self._placements = context.buffer(reserve=slots * PLACEMENT.itemsize)
             self._commands = context.buffer(reserve=slots * COMMAND.itemsize)
-            content.append((self._placements, "3f 2f 3f 1i 2i /i", "offset", "placement", "corner", "node", "place"))
+            content.append((self._placements, "4f 4f 4i /i", "cloud_origin", "cloud_corner", "cloud_numbers"))
         self._points = context.vertex_array(self._program, content)
         self._closer, self._dimmer = (
             context.program(vertex_shader=_shader("picture.vert.glsl"), fragment_shader=_shader(name))
@@ -229,13 +238,13 @@ class GlBackend:
         counts = self._arena.count[slots]
         placement = np.empty(len(nodes), dtype=PLACEMENT)
         placement["offset"] = self._arena.origin[slots] - np.array(camera.eye)
-        placement["placement"][:, 0] = self._arena.scale[slots]
-        placement["placement"][:, 1] = cut.spacing[part] * (splats.CLOSING * camera.focal)  # with no place to look up
+        placement["scale"] = self._arena.scale[slots]
+        placement["side"] = cut.spacing[part] * (splats.CLOSING * camera.focal)
         placement["node"] = nodes
-        placement["place"][:, 0] = np.arange(len(cut.nodes))[part] + np.where(cut.starved[part], STARVED, 0)
-        placement["place"][:, 1] = -1
+        placement["row"] = np.arange(len(cut.nodes))[part] + np.where(cut.starved[part], STARVED, 0)
+        placement["level"] = -1
         if cut.places is not None:
-            placement["place"][:, 1] = cut.places.level[part]
+            placement["level"] = cut.places.level[part]
             placement["corner"] = self._arena.origin[slots] - cut.places.corner[part]
         first = slots * self._samples
         if self._one_draw:
@@ -246,14 +255,11 @@ class GlBackend:
             self._commands.write(commands)
             self._points.render_indirect(self._commands, moderngl.POINTS, len(nodes))
             return
-        names = PLACEMENT.names or ()
-        uniforms = [self._program[name] for name in names]
-        columns = [placement[name].tobytes() for name in names]
-        sizes = [PLACEMENT[name].itemsize for name in names]
+        write, render, size = self._program["cloud"].write, self._points.render, PLACEMENT.itemsize
+        told = placement.tobytes()
         for row, (count, start) in enumerate(zip(counts.tolist(), first.tolist(), strict=True)):
-            for uniform, column, size in zip(uniforms, columns, sizes, strict=True):
-                uniform.write(column[row * size : (row + 1) * size])
-            self._points.render(moderngl.POINTS, vertices=count, first=start)
+            write(told[row * size : (row + 1) * size])
+            render(moderngl.POINTS, count, first=start)
 
     def _close_holes(self, layers: _Layers, camera: Camera) -> _Layers:
         self._closed.target.use()

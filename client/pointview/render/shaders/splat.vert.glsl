@@ -6,18 +6,18 @@
 in vec4 vertex;      // x, y, z in steps; two octahedral bytes
 in vec4 color;       // 0 to 1
 
+// offset of the cloud's (0, 0, 0) from the eye, axes of model space; model units of a step
+// offset of the same from the corner of the node's cell; side of a splat, pixels times depth
+// node; its row among the places, + STARVED; its level, or -1: one spacing everywhere
 #ifdef COMMANDS
-in vec3 offset;      // of the cloud's (0, 0, 0) from the eye, axes of model space
-in vec2 placement;   // model units of a step; side of a splat, pixels times depth
-in vec3 corner;      // of the node's cell to the cloud's (0, 0, 0), axes of model space
-in int node;
-in ivec2 place;      // row of the node among the places, + STARVED; its level, or -1: one spacing everywhere
+in vec4 cloud_origin;
+in vec4 cloud_corner;
+in ivec4 cloud_numbers;
 #else
-uniform vec3 offset;
-uniform vec2 placement;
-uniform vec3 corner;
-uniform int node;
-uniform ivec2 place;
+uniform ivec4 cloud[3];
+#define cloud_origin intBitsToFloat(cloud[0])
+#define cloud_corner intBitsToFloat(cloud[1])
+#define cloud_numbers cloud[2]
 #endif
 
 uniform mat3 rotation;     // model space to camera space: right, up, depth
@@ -141,7 +141,7 @@ void drop() {
 }
 
 void main() {
-    vec3 q = offset + placement.x * vertex.xyz;
+    vec3 q = cloud_origin.xyz + cloud_origin.w * vertex.xyz;
     center = rotation * q;
     float depth = center.z;
     if (!(depth > range.x)) {
@@ -157,12 +157,13 @@ void main() {
     normal = normalize(rotation * normal);
     vec2 shade = lit ? (has_normal ? light(normal) : vec2(UNLIT, 0.0)) : vec2(1.0, 0.0);
     rgb = min(color.rgb * albedo * shade.x + shade.y, 1.0);
-    seen = node;
+    seen = cloud_numbers.x;
     middle = 0.5 * size + center.xy * (focal / depth);
-    float across = placement.y;
-    bool starved = place.x >= STARVED;
-    if (place.y >= 0) {
-        float spacing = spacing_at(place.x & (STARVED - 1), place.y, corner + placement.x * vertex.xyz);
+    float across = cloud_corner.w;
+    bool starved = cloud_numbers.y >= STARVED;
+    if (cloud_numbers.z >= 0) {
+        vec3 inside = cloud_corner.xyz + cloud_origin.w * vertex.xyz;
+        float spacing = spacing_at(cloud_numbers.y & (STARVED - 1), cloud_numbers.z, inside);
         across = abs(spacing) * closing;
         starved = spacing < 0.0;
     }
