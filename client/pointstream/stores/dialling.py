@@ -1,7 +1,7 @@
 """An httpx transport of one connection that can be opened ahead of its first request.
 
-A connection costs a round trip before the first request can go out on it, and httpx opens one only for a request. So here
-is httpcore's pool of one connection, over a network backend that may already hold the open stream when it is asked.
+A connection costs a round trip before the first request can go out on it, and httpx opens one only for a request. So
+here is httpcore's pool of one connection, over a network backend that may hold the open stream already when asked.
 """
 
 from __future__ import annotations

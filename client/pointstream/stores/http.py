@@ -141,8 +141,7 @@ class HttpStore(KeepsNothing):
                 body.feed(wanted.start, self._whole[wanted.start : wanted.stop])
                 break
             before = body.offset
-            while (wait := self._breaker.check(self._clock())) > 0.0:
-                await asyncio.sleep(wait)
+            await self._turn()
             try:
                 moved = await self._attempt(body)
             except Retry as retry:
@@ -174,6 +173,13 @@ class HttpStore(KeepsNothing):
     async def close(self) -> None:
         """Close all connections."""
         await self._lanes.close()
+
+    async def _turn(self) -> None:
+        """Wait until the breaker lets a request through; Unavailable if the host is to be left alone."""
+        wait = self._breaker.check(self._clock())
+        if wait > 0.0:
+            await asyncio.sleep(wait)
+            await self._turn()
 
     def _wait(self, tries: Tries, retry: Retry) -> float:
         """Seconds to wait before a range is asked for again; Unavailable if it is not to be."""
