@@ -14,6 +14,7 @@ from lpc.points import PointBatch
 
 from .readers import Scan, open_scan
 from .readers.detect import SUFFIXES
+from .readers.directory import scan_files
 from .readers.scan import DEFAULT_ATTRIBUTES
 
 if TYPE_CHECKING:
@@ -92,19 +93,15 @@ def expand(sources: Sequence[Source]) -> list[Source]:
 
     Raises
     ------
-    BuildError
+    ScanError
         If a directory holds none.
     """
     found: list[Source] = []
     for source in sources:
-        if not isinstance(source, str | Path) or not Path(source).is_dir():
+        if isinstance(source, str | Path) and Path(source).is_dir():
+            found.extend(scan_files(Path(source), SUFFIXES))
+        else:
             found.append(source)
-            continue
-        files = sorted(Path(source).iterdir(), key=lambda path: path.name)
-        scans = [path for path in files if path.suffix.lower() in SUFFIXES and path.name[0] != "." and path.is_file()]
-        if not scans:
-            raise BuildError(f"the directory {source} holds no scan; name one that does, or files")
-        found.extend(scans)
     return found
 
 

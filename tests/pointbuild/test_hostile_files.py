@@ -54,8 +54,7 @@ def built(scans: list[Path], out: Path, *options: str) -> str:
     arguments = [*map(str, scans), "-o", str(out), "--cloud-size", "64", "--json", *options]
     result = CliRunner().invoke(build, arguments)
     assert result.exit_code == 0, result.output or result.exception
-    files = [file for scan in scans for file in (sorted(scan.iterdir()) if scan.is_dir() else [scan])]
-    against = [part for file in files for part in ("--against", str(file))]
+    against = [part for scan in scans for part in ("--against", str(scan))]
     checked = CliRunner().invoke(verify, [str(out), *against, "--json"])
     assert checked.exit_code == 0, checked.output
     return result.stderr

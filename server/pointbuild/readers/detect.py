@@ -10,6 +10,7 @@ from typing import Literal
 from lpc.errors import LpcError, ScanError
 from lpc.points import PointBatch
 
+from .directory import DirectoryScan, scan_files
 from .scan import CUT_SHORT, Normals, ReadOptions, Scan, ScanInfo
 
 _KINDS = {
@@ -21,7 +22,8 @@ _KINDS = {
     "OBJ": (".obj",),
     "text": (".xyz", ".pts", ".csv", ".txt", ".asc", ".xyzrgb", ".xyzn"),
 }
-SUFFIXES = {suffix: kind for kind, suffixes in _KINDS.items() for suffix in suffixes}
+_KIND_OF = {suffix: kind for kind, suffixes in _KINDS.items() for suffix in suffixes}
+SUFFIXES = frozenset(_KIND_OF)
 _HEAD = 1 << 12
 
 
@@ -33,7 +35,7 @@ def open_scan(
     Parameters
     ----------
     path : str or Path
-        PLY, LAS, LAZ, E57, PCD, NPZ, OBJ, or text (XYZ, PTS, CSV, TXT, ASC).
+        PLY, LAS, LAZ, E57, PCD, NPZ, OBJ, or text (XYZ, PTS, CSV, TXT, ASC); or a directory of such files.
     normals, attributes
         See `ReadOptions`.
 
@@ -43,6 +45,9 @@ def open_scan(
         If the file is missing, empty, of no known kind, or its head cannot be read.
     """
     path = Path(path)
+    if path.is_dir():
+        files = scan_files(path, SUFFIXES)
+        return DirectoryScan(path, [open_scan(file, normals=normals, attributes=attributes) for file in files])
     kind = detect(path)
     try:
         scan = _reader(kind, path, ReadOptions(normals=normals, attributes=attributes))
@@ -69,7 +74,7 @@ def detect(path: Path) -> str:
     if not head:
         raise ScanError(f"{path}: is empty; there is nothing to build")
     by_content = _kind_of(head)
-    by_suffix = SUFFIXES.get(path.suffix.lower())
+    by_suffix = _KIND_OF.get(path.suffix.lower())
     if by_content is None and by_suffix in ("OBJ", "text") and b"\0" not in head:
         return by_suffix
     if by_content is not None:
