@@ -146,16 +146,17 @@ class Build:
             self.held[item.key] |= kept
         return not before
 
-    def items_within(self, stop: int, nodes: NDArray[np.int64]) -> list[Item]:
-        """Clouds of `nodes`, and pages not yet loaded, that end at or before `stop`."""
-        ends = self.index.offset[nodes] + self.index.size[nodes]
-        inside = nodes[(ends <= min(stop, self.length)) & ~self.residency.resident[nodes] & ~self.busy[nodes]]
+    def items_before(self, stop: int, nodes: NDArray[np.int64]) -> list[Item]:
+        """Clouds of `nodes`, and pages not yet loaded, that start before `stop` and end with the file or before."""
+        starts, ends = self.index.offset[nodes], self.index.offset[nodes] + self.index.size[nodes]
+        there = (starts < stop) & (ends <= self.length)
+        inside = nodes[there & ~self.residency.resident[nodes] & ~self.busy[nodes]]
         items = [
             Item(node, int(self.index.offset[node]), int(self.index.offset[node] + self.index.size[node]))
             for node in inside.tolist()
         ]
         for page in np.flatnonzero(~self.index.page_loaded & (self.index.page_offset > 0)).tolist():
             item = self.page_item(page)
-            if item.stop <= min(stop, self.length):
+            if item.start < stop and item.stop <= self.length:
                 items.append(item)
         return items

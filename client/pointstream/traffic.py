@@ -215,10 +215,14 @@ class Traffic:
         return self.build
 
     def _claim(self, build: Build, request: Request, assembly: Assembly, nodes: NDArray[np.int64]) -> None:
-        """Expect in the probe whatever of these nodes, and of the pages known now, lies inside it."""
-        items = [item for item in build.items_within(request.range.stop, nodes) if not self.scheduler.flies(item.key)]
+        """Expect in the probe whatever of these nodes, and of the pages known now, lies inside it.
+
+        What it cuts in two is asked for when it is over: the rest of it.
+        """
+        stop = request.range.stop
+        items = [item for item in build.items_before(stop, nodes) if not self.scheduler.flies(item.key)]
         self.scheduler.claim(request, tuple(items))
-        assembly.expect(items)
+        assembly.expect(item for item in items if item.stop <= stop)
 
     async def _fetch(self, build: Build, request: Request, scheduler: Scheduler) -> None:
         assembly = Assembly(request.range.start, request.items)
