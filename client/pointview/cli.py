@@ -138,14 +138,17 @@ def render(
     cache: str | None,
     as_json: bool,
 ) -> None:
-    """Draw MODEL, a path or address of a .lpc file, into OUT.png.
+    """Draw MODEL, a path or address of a .lpc file, into OUT.{png,jpg,webp,tif,bmp,ppm}.
 
     With --path or --turntable, into OUT-0001.png, OUT-0002.png, ... and an animated file.
     """
     from .render.backend import Style
-    from .render.picture import save_png
+    from .render.picture import FORMATS, save_picture
     from .still import StillOptions, draw_still
 
+    many = path is not None or turntable is not None
+    if out.suffix.lower() not in FORMATS and (out.suffix or not many):
+        raise click.UsageError(f"{out}: the suffix says the format; use one of {', '.join(FORMATS)}")
     width, height = size
     options = StillOptions(
         width=width,
@@ -157,14 +160,14 @@ def render(
         threads=min(os.cpu_count() or 1, MOST_THREADS),
         style=Style(two_sided=two_sided),
     )
-    if path is not None or turntable is not None:
+    if many:
         if path is not None and (view is not None or turntable is not None):
             raise click.UsageError("--path excludes --view and --turntable")
         _sequence(model, out, options, path, turntable, fps, animation, choose_cache(cache, model), as_json)
         return
     with Waiting() as waiting:
         still = asyncio.run(draw_still(model, options, cache=choose_cache(cache, model), progress=waiting.show))
-    save_png(still.frame.rgb, out)
+    save_picture(still.frame.rgb, out)
     for problem in still.problems:
         click.echo(f"pointstream: {problem}", err=True)
     if as_json:

@@ -20,7 +20,7 @@ from pointstream.stores import open_store
 
 from .camera import Camera
 from .render import open_backend
-from .render.picture import save_png
+from .render.picture import save_picture
 from .settle import settle
 from .still import CAPACITY, StillOptions, camera_of, cut_of
 from .window.controls import Viewpoint, fit, orbit, zoom
@@ -155,7 +155,7 @@ async def draw_sequence(
                 frame = backend.draw(cut, layer.take, camera_of(layer, one), options.style)
                 drawing += time.perf_counter() - start
                 most = max(most, frame.splats)
-                save_png(frame.rgb, file)
+                save_picture(frame.rgb, file)
                 if progress is not None:
                     progress(1)
         finally:

@@ -20,6 +20,7 @@ from lpc.info import info_dict
 from .build import BuildReport, build_model
 from .options import BuildOptions
 from .progress import Bar, Lines, Silent
+from .readers.detect import SUFFIXES
 from .sizes import parse_size
 
 if TYPE_CHECKING:
@@ -73,6 +74,8 @@ def build(
         else tuple(name.strip() for name in attributes.split(",") if name.strip()),
         **options,
     )
+    if out.suffix.lower() in SUFFIXES:
+        raise click.UsageError(f"{out} is the name of a scan, and a model is none; give it the suffix .lpc")
     if share is not None and dask is None:
         raise click.BadParameter("only a build on a cluster (--dask) shares files", param_hint="--share")
     with _stopped_by_signals(), _progress(as_json) as progress, _cluster(dask, share) as cluster:

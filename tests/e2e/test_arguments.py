@@ -113,3 +113,20 @@ def test_bounds_are_finite(bounds: str, capsys: pytest.CaptureFixture[str]) -> N
     for words in (["export", "m.lpc", "out.ply"], ["fetch", "m.lpc", "copies"]):
         assert command.run([*words, f"--bounds={bounds}"]) == 2
         assert "finite" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("out", ["m.ply", "M.LAZ", "m.xyz", "m.npz"])
+def test_a_model_does_not_get_the_name_of_a_scan(
+    out: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path(out).write_text("precious")
+    assert command.run(["build", "scan.ply", "-o", out]) == 2
+    assert capsys.readouterr().err.startswith(f"pointstream: {out} is the name of a scan")
+    assert Path(out).read_text() == "precious"
+
+
+@pytest.mark.parametrize("out", ["m.docx", "m", "m.lpc", "m.png.txt"])
+def test_a_picture_has_the_suffix_of_one(out: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command.run(["render", "m.lpc", out]) == 2
+    assert "the suffix says the format; use one of .png, .jpg" in capsys.readouterr().err

@@ -15,7 +15,7 @@ from pointview.camera import Camera
 from pointview.refine import refine
 from pointview.render import Style, open_backend, shading
 from pointview.render.cpu import CpuBackend
-from pointview.render.picture import YELLOW, save_png, tint_starved
+from pointview.render.picture import YELLOW, save_picture, tint_starved
 
 
 def camera_at(eye, *, target=(0.0, 0.0, 0.0), width=90, height=70):
@@ -282,5 +282,5 @@ def test_starved_pixels_are_tinted(tmp_path):
     assert not whole.starved.any()
     from PIL import Image
 
-    save_png(twin, tmp_path / "twin.png")
+    save_picture(twin, tmp_path / "twin.png")
     np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "twin.png")), twin)

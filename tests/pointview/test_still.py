@@ -158,3 +158,16 @@ def test_no_model_and_no_room_for_the_picture(model_file, tmp_path, capsys):
         assert said.out == ""
         assert said.err.count("\n") == 1
         assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("suffix", "kind", "close"), [("png", "PNG", 0), ("jpg", "JPEG", 12), ("WEBP", "WEBP", 0), ("tif", "TIFF", 0)]
+)
+def test_the_suffix_says_the_format(model_file, tmp_path, suffix, kind, close):
+    assert run(model_file, tmp_path / "right.png", "--size", "80x60").exit_code == 0
+    out = tmp_path / f"out.{suffix}"
+    assert run(model_file, out, "--size", "80x60").exit_code == 0
+    right = np.asarray(Image.open(tmp_path / "right.png")).astype(int)
+    with Image.open(out) as picture:
+        assert picture.format == kind
+        assert np.abs(np.asarray(picture.convert("RGB")).astype(int) - right).mean() <= close

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from lpc.header import Header
     from pointlink.profiles import Profile
+    from pointstream.stats import ErrorReport
 
     from .path import ViewPath
 
@@ -115,13 +116,13 @@ def run_experiment(
     """
     # The first reference comes first: it loads the compiled kernels, which would hold a real clock's first frames up.
     say("drawing the whole view for comparison")
-    references = asyncio.run(_references(experiment, [0.0]))
+    references, lacks = asyncio.run(_references(experiment, [0.0]))
     say(f"streaming for {experiment.seconds:g} s ({experiment.clock} clock) over {experiment.profile}")
     with progress("streaming, seconds", max(1, int(experiment.seconds))) as advance:
         recording = network.run(experiment.clock, _stream(experiment, _whole_seconds(advance)))
     if experiment.views is not None and experiment.views.moves:
         say("drawing the path for comparison")
-        references = asyncio.run(_references(experiment, [moment.t for moment in recording.moments]))
+        references, lacks = asyncio.run(_references(experiment, [moment.t for moment in recording.moments]))
     else:
         references = references * len(recording.moments)
     with progress("comparing pictures", len(recording.moments)) as advance:
@@ -129,7 +130,7 @@ def run_experiment(
         for moment, reference in zip(recording.moments, references, strict=True):
             curve.append(_entry(moment, reference))
             advance(1)
-    return _report(experiment, recording, curve), recording.moments
+    return _report(experiment, recording, curve, lacks), recording.moments
 
 
 def _whole_seconds(advance: Callable[[int], None]) -> Callable[[float], None]:
@@ -152,8 +153,8 @@ async def _stream(experiment: Experiment, tell: Callable[[float], None]) -> Reco
         return await record(opening, experiment.camera_at, experiment.session, clock, tell=tell)
 
 
-async def _references(experiment: Experiment, times: Sequence[float]) -> list[Frame]:
-    """Draw the views at these times with everything resident, straight from the model."""
+async def _references(experiment: Experiment, times: Sequence[float]) -> tuple[list[Frame], list[str]]:
+    """Draw the views at these times with everything resident, straight from the model; and say what they lack."""
     style, threads = Style(), experiment.session.threads
     store = open_store(experiment.model, clock=time.monotonic)
     layer = await AccessLayer.open(store, options=LayerOptions(capacity=CAPACITY), clock=time.monotonic)
@@ -166,7 +167,7 @@ async def _references(experiment: Experiment, times: Sequence[float]) -> list[Fr
                 look = partial(_look, camera=camera, tolerance=experiment.tolerance)
                 cut = await settle(layer, look, clock=time.monotonic)
                 frames.append(backend.draw(cut, layer.take, camera, style))
-            return frames
+            return frames, [_line(error) for error in layer.stats.errors]
         finally:
             backend.close()
     finally:
@@ -177,7 +178,13 @@ def _look(layer: AccessLayer, *, camera: Camera, tolerance: float) -> Any:
     return refine(layer.index, camera, tolerance, layer.resident)
 
 
-def _report(experiment: Experiment, recording: Recording, curve: Sequence[dict[str, Any]]) -> Report:
+def _line(error: ErrorReport) -> str:
+    return f"{error.text} ({error.count} times)"
+
+
+def _report(
+    experiment: Experiment, recording: Recording, curve: Sequence[dict[str, Any]], lacks: Sequence[str]
+) -> Report:
     assert recording.stats is not None
     assert recording.header is not None
     stats, rate = recording.stats, experiment.profile.down_rate
@@ -205,7 +212,10 @@ def _report(experiment: Experiment, recording: Recording, curve: Sequence[dict[s
         payload_bytes=stats.payload_bytes,
         wanted_s=stats.wanted_seconds,
         frames=recording.frames,
-        errors=tuple(f"{error.text} ({error.count} times)" for error in stats.errors),
+        errors=(
+            *map(_line, stats.errors),
+            *(f"the pictures that the curve compares with lack data too: {text}" for text in lacks),
+        ),
         curve=tuple(curve),
     )
 

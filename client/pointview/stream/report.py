@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lpc.errors import StoreError
-from pointview.render.picture import save_png, tint_starved
+from pointview.render.picture import save_picture, tint_starved
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -106,7 +106,7 @@ def write_report(folder: Path, report: Report, moments: Sequence[Moment]) -> lis
                 (folder / f"{stem}.png", picture.rgb),
                 (folder / f"{stem}-starved.png", tint_starved(picture)),
             ):
-                save_png(rgb, path)
+                save_picture(rgb, path)
                 written.append(path)
         written.append(folder / "curve.png")
         plot_curve(written[-1], report)

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from support.frames import whole_index
 
 from pointstream.command import run as command
 
@@ -67,7 +68,7 @@ def test_wrong_arguments_exit_2(small, tmp_path, capsys, wrong):
     assert run(small, *given(tmp_path / "report"), *arguments) == 2
     said = capsys.readouterr()
     assert said.out == ""
-    assert "Error" in said.err
+    assert said.err.startswith("pointstream: ")
     assert not (tmp_path / "report").exists()
 
 
@@ -135,3 +136,21 @@ def test_an_interrupt_is_one_line(endless, tmp_path):
         rest = process.stderr.read()
     assert process.returncode == 130
     assert rest.split("\n") in (["", "pointstream: interrupted", ""], ["pointstream: interrupted", ""])
+
+
+def test_damage_is_told_also_where_the_comparison_lacks_it(small, tmp_path, capsys):
+    """The curve of a damaged model is against pictures with the same hole: it must not look like a perfect one."""
+    data = bytearray(Path(small).read_bytes())
+    place = whole_index(bytes(data)).cloud_range(1)
+    data[place.start + 9] ^= 0x20
+    broken = tmp_path / "broken.lpc"
+    broken.write_bytes(data)
+    assert run(broken, *given(tmp_path / "report", link="none")) == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("pointstream: ")]
+    over_the_link, compared_with = told
+    assert "cloud 1: " in over_the_link
+    assert compared_with.startswith("pointstream: the pictures that the curve compares with lack data too: ")
+    assert f"{broken}: cloud 1: " in compared_with
+    assert json.loads((tmp_path / "report" / "report.json").read_text())["errors"] == [
+        line.removeprefix("pointstream: ") for line in told
+    ]
