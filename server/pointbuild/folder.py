@@ -14,7 +14,7 @@ import json
 import os
 import platform
 import shutil
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -160,22 +160,27 @@ def work_folder(
 
 
 def _lock(path: Path, out: Path) -> int:
+    """Make the folder and lock it; the open descriptor holds the lock."""
     while True:
-        path.mkdir(mode=0o700, exist_ok=True)
+        try:
+            path.mkdir(mode=0o700, exist_ok=True)
+        except OSError as error:
+            raise BuildError(f"{path}: {error.strerror or error}; choose another output or --scratch") from error
         try:
             lock = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if os.fstat(lock).st_ino == path.stat().st_ino:
-                    return lock
-            except BlockingIOError as error:
-                os.close(lock)
-                raise BuildError(f"another build of {out} is running: wait for it, or choose another output") from error
-            except FileNotFoundError:
-                pass
-            os.close(lock)  # the build that held it has just removed it
         except FileNotFoundError:
-            continue
+            continue  # the build that held it has just removed it
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            os.close(lock)
+            raise BuildError(f"another build of {out} is running: wait for it, or choose another output") from error
+        except OSError:
+            return lock  # a file system without locks: two builds at once are their owner's care
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(lock), path.stat()):
+                return lock
+        os.close(lock)  # of a folder that is gone
 
 
 def _recall(path: Path, manifest: dict[str, Any] | None, tell: Callable[[str], None]) -> bool:

@@ -19,7 +19,8 @@ RESERVE = 48 << 20
 """Kept free for what allocators hold back."""
 
 NODE_BYTES = 400  # a node's arrays, and their copies while the trees are joined
-READ_BYTES = 320  # a sample in a reader's batch, decoded and as it was stored
+READ_BYTES = 320  # a sample in a reader's batch, decoded and as it was stored, and on its way to a row
+ATTRIBUTE_BYTES = 5  # times its attributes
 BEST_BLOCK = 1 << 18
 BEST_BUCKET = 1 << 20  # larger buckets cost no less (studied), and keep threads from sharing the work evenly
 LEAST_BLOCK = 1 << 13
@@ -56,14 +57,14 @@ def choose_sizes(options: BuildOptions, samples: int, row_bytes: int, resident: 
     room = options.memory_bytes - held
     least_bucket = max(4 * options.cloud_size, 1 << 16)
     per_sample = bucket_bytes(row_bytes)
-    threads = options.workers
-    while threads > 1 and room < threads * least_bucket * per_sample + (threads + 2) * LEAST_BLOCK * READ_BYTES:
+    threads, read = options.workers, read_bytes(row_bytes)
+    while threads > 1 and room < threads * least_bucket * per_sample + (threads + 2) * LEAST_BLOCK * read:
         threads -= 1
-    block = min(room // ((threads + 2) * READ_BYTES), BEST_BLOCK)
+    block = min(room // ((threads + 2) * read), BEST_BLOCK)
     fair = max(samples // (4 * (threads + 2)), least_bucket)  # buckets that move are on disk twice: a quarter in all
     bucket = min(room // (threads * per_sample), BEST_BUCKET, fair)
     if block < LEAST_BLOCK or bucket < least_bucket:
-        need = held + least_bucket * per_sample + 3 * LEAST_BLOCK * READ_BYTES
+        need = held + least_bucket * per_sample + 3 * LEAST_BLOCK * read
         raise BuildError(
             f"{options.memory_bytes >> 20} MiB of memory are too few for clouds of {options.cloud_size}: "
             f"allow at least {(need >> 20) + 1} MiB (--memory)"
@@ -74,6 +75,11 @@ def choose_sizes(options: BuildOptions, samples: int, row_bytes: int, resident: 
 def bucket_bytes(row_bytes: int) -> int:
     """Resident bytes per sample while a bucket is sorted: rows twice, keys, places and owners."""
     return 2 * row_bytes + 72
+
+
+def read_bytes(row_bytes: int) -> int:
+    """Resident bytes per sample while blocks are read and scattered."""
+    return READ_BYTES + ATTRIBUTE_BYTES * max(row_bytes - 32, 0)
 
 
 def resident_bytes() -> int:

@@ -249,6 +249,12 @@ def test_a_second_build_of_the_same_model_is_refused(scan: Path, tmp_path: Path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["m.lpc", "other.lpc"]
 
 
+def test_a_name_that_is_too_long_for_the_folder(scan: Path, tmp_path: Path) -> None:
+    with pytest.raises(BuildError, match="name too long"):
+        build_model([scan], tmp_path / f"{'m' * 250}.lpc", options(), clock=time.monotonic)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_models_of_one_name_share_a_scratch_directory(scan: Path, tmp_path: Path) -> None:
     for name in ("a", "b", "scratch"):
         (tmp_path / name).mkdir()
