@@ -53,13 +53,21 @@ PAUSE = 60
 class Occlusion:
     """What earlier frames of one view of one model told about hidden nodes.
 
+    Parameters
+    ----------
+    nodes : int
+        Of the model.
+    kept : int
+        Tests for which a node stays visible; 1 where the camera stands still.
+
     Attributes
     ----------
     hidden : (nodes,) bool
         For `refine`.
     """
 
-    def __init__(self, nodes: int) -> None:
+    def __init__(self, nodes: int, *, kept: int = KEPT) -> None:
+        self._kept = kept
         self.hidden = np.zeros(nodes, dtype=bool)
         self._tested = np.zeros(nodes, dtype=np.int32)  # number of the last test, from 1 on
         self._seen = np.zeros(nodes, dtype=np.int32)
@@ -98,7 +106,7 @@ class Occlusion:
         before = self.hidden
         now = np.zeros_like(before)
         nodes = children[tested]
-        now[nodes] = self._seen[nodes] <= self._test - KEPT
+        now[nodes] = self._seen[nodes] <= self._test - self._kept
         self.hidden = now
         self._judge(len(nodes), int(np.count_nonzero(now)))
         return int(np.count_nonzero(before[seen]))
@@ -113,6 +121,6 @@ class Occlusion:
         """Pause where the tests hide too little."""
         self._trial += 1
         self._share = hidden / tested if tested else 0.0
-        if self._trial >= TRIAL + KEPT and tested and self._share < WORTH:
+        if self._trial >= TRIAL + self._kept and tested and self._share < WORTH:
             self._trial, self._pause = 0, PAUSE
             self.hidden = np.zeros_like(self.hidden)
