@@ -104,6 +104,7 @@ class ClusterCrew(Crew):
         """Call a function on the workers."""
         data = pickle.dumps(function)
         name = f"task-{hashlib.blake2b(data, digest_size=16).hexdigest()}"
+        self._share.make()  # it is gone if a build that goes on had encoded everything
         self._share.put(name, io.BytesIO(data))
         call = partial(perform, self._share, name, versions())
         return in_order(lambda item: self._cluster.executor.submit(call, item), items, self._cluster.ahead)

@@ -133,6 +133,49 @@ def test_the_command_says_when_no_scheduler_answers(tmp_path: Path, monkeypatch:
     assert CliRunner().invoke(build, [*arguments, "--share", "x"]).exit_code == 2
 
 
+KILLED = """
+import os, signal, sys, time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from pointbuild import BuildOptions, build_model
+from pointbuild.cluster import Cluster
+from pointbuild.progress import Silent
+
+class Killing(Silent):
+    now = ""
+    def stage(self, name, total):
+        self.now = name
+    def advance(self, samples):
+        if self.now == sys.argv[3]:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+options = BuildOptions(cloud_size=128, threads=1, bucket_samples=700, block_samples=2000)
+workers = Cluster(ThreadPoolExecutor(2), 4)
+build_model([Path(sys.argv[1])], Path(sys.argv[2]), options, Killing(), clock=time.monotonic, cluster=workers)
+"""
+
+
+@pytest.mark.parametrize("stage", ["partition", "encode", "write"])
+def test_a_builder_killed_in_the_middle_goes_on(stage: str, points: PointBatch, tmp_path: Path) -> None:
+    scan, out = tmp_path / "scan.npz", tmp_path / "m.lpc"
+    np.savez(scan, xyz=points.xyz, **points.attributes)
+    build_model([scan], tmp_path / "plain.lpc", OPTIONS, clock=time.monotonic)
+    command = [sys.executable, "-c", KILLED, str(scan), str(out), stage]
+    assert subprocess.run(command, env=environment(), check=False).returncode == -9
+    told: list[str] = []
+    with ThreadPoolExecutor(2) as executor:
+        workers = Cluster(executor, 4)
+        build_model([scan], out, OPTIONS, clock=time.monotonic, tell=told.append, cluster=workers)
+    assert "going on with the build that was stopped" in told[0]
+    assert out.read_bytes() == (tmp_path / "plain.lpc").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["m.lpc", "plain.lpc", "scan.npz"]
+
+
+def environment() -> dict[str, str]:
+    rooms = [str(ROOT / room) for room in ("common", "server", "client")]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(rooms)}
+
+
 class Dask:
     """A scheduler and two workers of one thread, each a process."""
 
@@ -157,10 +200,9 @@ class Dask:
         return self._start("dask_worker", *options)
 
     def _start(self, program: str, *options: str) -> subprocess.Popen[bytes]:
-        path = os.pathsep.join(str(ROOT / room) for room in ("common", "server", "client"))
         process = subprocess.Popen(
             [sys.executable, "-m", f"distributed.cli.{program}", *options],
-            env={**os.environ, "PYTHONPATH": path},
+            env=environment(),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
