@@ -93,11 +93,12 @@ def test_two_runs_are_the_same_run(small, tmp_path):
 def test_a_truncated_model_streams_what_is_there(small, tmp_path):
     data = small.read_bytes()
     cut_short = tmp_path / "short.lpc"
-    cut_short.write_bytes(data[: len(data) // 2])
+    here = 3 * len(data) // 4  # some leaves are there and some are not
+    cut_short.write_bytes(data[:here])
     report = stream(cut_short, tmp_path / "report", "--seconds", 2)
     last = report["curve"][-1]
     assert report["settled_s"] is None
-    assert 0.4 * len(data) < report["bytes"] <= len(data) // 2
+    assert 0.9 * here < report["bytes"] <= here
     assert 0 < last["starved_fraction"] < 1
     assert (last["psnr_db"], last["ssim"]) == (None, 1.0)  # the reference has no more of it
     assert report["wanted_s"] < 1.0  # what cannot come is not waited for
