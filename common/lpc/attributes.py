@@ -115,8 +115,14 @@ class Attribute:
 
     def to_json(self) -> dict[str, object]:
         """As it stands in the header."""
-        return {"name": self.name, "kind": self.kind, "dtype": self.dtype, "bits": self.bits,
-                "offset": self.offset, "scale": self.scale}
+        return {
+            "name": self.name,
+            "kind": self.kind,
+            "dtype": self.dtype,
+            "bits": self.bits,
+            "offset": self.offset,
+            "scale": self.scale,
+        }
 
     @classmethod
     def from_json(cls, entry: dict[str, Any]) -> Attribute:
@@ -128,8 +134,14 @@ class Attribute:
             If a field is missing, of the wrong type or out of range.
         """
         try:
-            return cls(name=str(entry["name"]), kind=entry["kind"], dtype=str(entry["dtype"]), bits=int(entry["bits"]),
-                       offset=int(entry["offset"]), scale=int(entry["scale"]))
+            return cls(
+                name=str(entry["name"]),
+                kind=entry["kind"],
+                dtype=str(entry["dtype"]),
+                bits=int(entry["bits"]),
+                offset=int(entry["offset"]),
+                scale=int(entry["scale"]),
+            )
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             if isinstance(error, Corrupt):
                 raise
