@@ -1,4 +1,4 @@
-"""What a build of so many samples takes, from what one was measured to take: linear, but for the tree in memory."""
+"""What a build of so many samples takes, from what one was measured to take: linear, on top of a fixed memory."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ BASE = 450e6
 
 NODE = 800.0
 """Resident bytes a node while the trees are joined."""
+
+CANDIDATE = 0.2
+"""Resident bytes a sample while thresholds are found: of one in 260 the priority and the bucket, and their order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +92,7 @@ def estimate(samples: float, costs: Costs, prices: Prices) -> Estimate:
         core_hours=core_hours,
         hours=hours,
         cluster_hours=cluster_hours,
-        memory=(BASE + NODE * samples / costs.node) / 1e9,
+        memory=(BASE + samples * (NODE / costs.node + CANDIDATE)) / 1e9,
         scratch=scratch,
         model=model,
         build=core_hours / BUSY * prices.core_hour + scratch * prices.scratch_gb_month * hours / 730,
