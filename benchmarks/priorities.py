@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
 SHARES = (0.9, 0.5, 0.1)
-SIZE = (640, 480)
-SECONDS = 30.0
+SIZE = (320, 240)
+SECONDS = 14.0
 PRIORITIES = ("index", "error")
 
 
@@ -58,6 +58,7 @@ def _curve(path: str, near: bool, priority: str) -> list[tuple[float, float]]:
         size=SIZE,
         tolerance=1.0,
         priority="error" if priority == "error" else "index",
+        occlusion="off",
         views=views,
     )
     report, _ = run_experiment(experiment, say=lambda _: None, progress=_silent)

@@ -330,17 +330,14 @@ def _error_per_byte(
 ) -> NDArray[np.float64]:
     """Screen error that fetching a node removes, per byte: projected spacing over tolerance, times visible area.
 
-    The area is that of the node's samples, one spacing squared each, as it is seen from the eye: less where the
-    normals lean away. Unknown nodes come first (infinite): their page costs little and hides what else is wanted.
+    The area is the square of the sphere's apparent radius. Half the tolerance is as good as nothing. Unknown nodes come
+    first (infinite): their page costs little and hides what else is wanted.
     """
     largest = float(max(camera.width, camera.height))
-    offset = index.center[nodes] - np.array(camera.eye)
-    distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-300)
-    toward = -np.einsum("ij,ij->i", index.cone_axis[nodes], offset) / distance
-    facing = np.where(index.cone_angle[nodes] < np.pi, np.maximum(toward, 0.1), 0.5)
-    fine = np.clip(child_px, tolerance, largest)
+    distance = np.maximum(np.linalg.norm(index.center[nodes] - np.array(camera.eye), axis=1), 1e-300)
+    fine = np.clip(child_px, 0.5 * tolerance, largest)
     removed = np.maximum(np.minimum(shown_px, largest) - fine, 0.0) / tolerance
-    area = index.samples[nodes] * np.minimum(index.spacing[nodes] * camera.focal / distance, largest) ** 2 * facing
+    area = np.minimum(index.radius[nodes] * camera.focal / distance, largest) ** 2
     score = removed * area / np.maximum(index.size[nodes], 1)
     return np.where(index.known[nodes], score, np.inf)
 

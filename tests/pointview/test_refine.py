@@ -263,13 +263,8 @@ def test_priorities(ring):
     def score(node):
         parent = ring.index.parent[node]
         shown, after = (pixels(ring.index, camera, number) for number in (parent, node))
-        offset = ring.index.center[node] - camera.eye
-        distance = np.linalg.norm(offset)
-        facing = max(-float(ring.index.cone_axis[node] @ offset) / distance, 0.1)
-        if ring.index.cone_angle[node] == np.float32(np.pi):
-            facing = 0.5
-        area = ring.index.samples[node] * min(ring.index.spacing[node] * camera.focal / distance, 300) ** 2 * facing
-        return max(min(shown, 300) - min(max(after, 0.5), 300), 0) / 0.5 * area / ring.index.size[node]
+        area = (ring.index.radius[node] * camera.focal / math.dist(ring.index.center[node], camera.eye)) ** 2
+        return (min(shown, 300) - min(max(after, 0.25), 300)) * min(area, 300.0**2) / ring.index.size[node]
 
     scores = [score(node) for node in by_error.wants.tolist()]
     np.testing.assert_allclose(scores, sorted(scores, reverse=True), rtol=1e-6)

@@ -38,7 +38,13 @@ LONGEST = 3600.0
     type=POSITIVE,
     help="Spacing of samples on the screen that is fine enough, pixels.",
 )
-@click.option("--priority", default="index", show_default=True, type=click.Choice(["index", "error"]))
+@click.option(
+    "--priority",
+    default="error",
+    show_default=True,
+    type=click.Choice(["index", "error"]),
+    help="Fetch by the screen error that a byte removes, or in the order of the file.",
+)
 @click.option(
     "--splat-rule",
     default="place",
@@ -92,7 +98,7 @@ def stream(
         seconds=seconds,
         size=size,
         tolerance=tolerance,
-        priority="error" if priority == "error" else "index",
+        priority="index" if priority == "index" else "error",
         splat_rule="paper" if splat_rule == "paper" else "place",
         occlusion="off" if occlusion == "off" else "auto",
         views=views,
