@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -13,11 +13,15 @@ from pointstream.stores import open_store
 from .budget import tolerance_for_budget
 from .camera import Camera
 from .refine import Cut, refine
-from .render import Frame, Kind, Style, open_backend
+from .render import Backend, Frame, Kind, Style, open_backend
 from .settle import settle
+from .unveil import unveil
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+
+    import numpy as np
+    from numpy.typing import NDArray
 
     from pointstream.cache import Cache
 
@@ -43,6 +47,8 @@ class StillOptions:
     threads : int
         Threads of the CPU backend.
     style : Style
+    occlusion : bool
+        Leave out what is hidden, where that pays; not with a budget, which counts what is in view.
     patience : float
         Seconds to wait for a host that sends nothing.
     """
@@ -55,6 +61,7 @@ class StillOptions:
     backend: Kind = "auto"
     threads: int = 1
     style: Style = field(default_factory=Style)
+    occlusion: bool = True
     patience: float = 60.0
 
 
@@ -97,11 +104,10 @@ async def draw_still(
     store = open_store(target, clock=time.monotonic, cache=cache)
     layer = await AccessLayer.open(store, options=LayerOptions(capacity=CAPACITY), clock=time.monotonic)
     try:
-        look = partial(cut_of, options=options)
-        cut = await settle(layer, look, clock=time.monotonic, patience=options.patience, progress=progress)
-        camera = camera_of(layer, options)
         backend = open_backend(options.backend, layer.header, threads=options.threads)
         try:
+            look, cut = await _settle(layer, options, backend, progress)
+            camera = camera_of(layer, options)
             backend.draw(cut, layer.take, camera, options.style)  # uploads, and compiles at the first use
             start = time.perf_counter()
             look(layer)
@@ -131,7 +137,26 @@ def camera_of(layer: AccessLayer, options: StillOptions) -> Camera:
     return Camera.from_view(options.view, width=options.width, height=options.height)
 
 
-def cut_of(layer: AccessLayer, options: StillOptions) -> Cut:
+async def _settle(
+    layer: AccessLayer, options: StillOptions, backend: Backend, progress: Callable[[Cut], None] | None
+) -> tuple[Callable[[AccessLayer], Cut], Cut]:
+    """Fetch the view; return how to look at it again, and what it shows."""
+    wait = partial(settle, clock=time.monotonic, patience=options.patience, progress=progress)
+    if not options.occlusion or options.budget is not None:
+        look = partial(cut_of, options=options)
+        return look, await wait(layer, look)
+
+    def coarser(layer: AccessLayer, factor: float, hidden: NDArray[np.bool_] | None) -> Cut:
+        return cut_of(layer, replace(options, tolerance=options.tolerance * factor), hidden)
+
+    def draw(cut: Cut) -> tuple[Camera, Frame]:
+        camera = camera_of(layer, options)
+        return camera, backend.draw(cut, layer.take, camera, options.style)
+
+    return await unveil(layer, coarser, wait, draw)
+
+
+def cut_of(layer: AccessLayer, options: StillOptions, hidden: NDArray[np.bool_] | None = None) -> Cut:
     """Compute the cut of what is here; a budget counts what is known, so that it settles on what will be here."""
     camera, tolerance = camera_of(layer, options), options.tolerance
     one_sided = not options.style.two_sided
@@ -139,4 +164,4 @@ def cut_of(layer: AccessLayer, options: StillOptions) -> Cut:
         tolerance = tolerance_for_budget(
             layer.index, camera, options.budget, layer.index.known, at_least=tolerance, cull_backfaces=one_sided
         )
-    return refine(layer.index, camera, tolerance, layer.resident, cull_backfaces=one_sided)
+    return refine(layer.index, camera, tolerance, layer.resident, cull_backfaces=one_sided, hidden=hidden)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,8 +15,10 @@ from PIL import Image
 from support import models
 from support.servers import serve_in_thread
 
+from lpc.points import PointBatch
 from pointstream.command import run as command
 from pointview.cli import render
+from pointview.render import Style
 from pointview.render.cpu import CpuBackend
 from pointview.still import StillOptions, draw_still
 
@@ -54,7 +58,7 @@ def test_view_tolerance_and_sides(model_file, tmp_path):
     both = json.loads(run(model_file, tmp_path / "c.png", "--view", view, "--two-sided", "--json").stdout)
     assert coarse["splats"] < fine["splats"] <= both["splats"]
     assert coarse["bytes_read"] <= fine["bytes_read"]
-    assert fine["culled"]["backface"] > 0
+    assert fine["culled"]["backface"] + fine["culled"]["occluded"] > 0
     assert both["culled"]["backface"] == 0
 
 
@@ -171,3 +175,18 @@ def test_the_suffix_says_the_format(model_file, tmp_path, suffix, kind, close):
     with Image.open(out) as picture:
         assert picture.format == kind
         assert np.abs(np.asarray(picture.convert("RGB")).astype(int) - right).mean() <= close
+
+
+def test_what_is_hidden_is_not_drawn(tmp_path):
+    """Spheres in one another: the inner ones are not drawn, and the picture is the same."""
+    shells = [surfaces.sphere(8000, seed=number, radius=1 - 0.2 * number) for number in range(4)]
+    xyz = np.concatenate([shell.xyz for shell in shells])
+    normal = np.concatenate([shell.normal for shell in shells])
+    path = tmp_path / "onion.lpc"
+    path.write_bytes(build_bytes(PointBatch(xyz, {"normal": normal}), cloud_size=128, page_nodes=32, spacing=0.03))
+    options = StillOptions(width=200, height=200, style=Style(two_sided=True), tolerance=2.0)
+    seen, whole = (asyncio.run(draw_still(str(path), replace(options, occlusion=on))) for on in (True, False))
+    assert seen.report["culled"]["occluded"] > 0
+    assert seen.report["splats"] < 0.6 * whole.report["splats"]
+    covered = (seen.frame.node >= 0) | (whole.frame.node >= 0)
+    assert (seen.frame.rgb != whole.frame.rgb).any(axis=2)[covered].mean() < 0.002
