@@ -92,12 +92,13 @@ class ClusterCrew(Crew):
     def share(self, regions: Regions, folder: Folder) -> SharedRegions:
         """Move the scattered rows to the share."""
         shared = SharedRegions(self._share, regions.dtype, regions.first)
+        self._share.make()
         journal = folder.journal("share")
-        if not journal.entries:
-            self._share.make()
-            shared.take(regions)
-            journal.add(regions.first)
-            regions.clear()
+        # From the end of the file, so that its room becomes that of the share.
+        for bucket in reversed(range(len(regions.first) - 1 - journal.entries)):
+            shared.take(regions, bucket)
+            journal.add(np.array(bucket))
+            regions.cut(bucket)
         return shared
 
     def spread(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[tuple[Item, Result]]:

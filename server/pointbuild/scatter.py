@@ -140,9 +140,9 @@ class Regions:
         """Give the rows after every bucket was replaced: they are at the same place."""
         return self
 
-    def clear(self) -> None:
-        """Give back the room of all rows."""
-        os.truncate(self._file, 0)
+    def cut(self, bucket: int) -> None:
+        """Give back the room of a bucket and of all after it; they cannot be read again."""
+        os.truncate(self._file, int(self.first[bucket]) * self.dtype.itemsize)
 
     def remove(self) -> None:
         """Remove the file."""

@@ -118,13 +118,13 @@ class SharedRegions:
     def __init__(self, share: Share, dtype: np.dtype[Any], first: NDArray[np.int64], kind: str = "scattered") -> None:
         self.share, self.dtype, self.first, self._kind = share, dtype, first, kind
 
-    def take(self, regions: Regions) -> None:
-        """Copy all rows as they were scattered."""
-        for bucket, (first, stop) in enumerate(zip(regions.first[:-1], regions.first[1:], strict=True)):
-            with tempfile.TemporaryFile() as file:
-                for rows in regions.chunks(int(first), int(stop - first), _PIECE):
-                    file.write(rows.view(np.uint8).data)
-                self.share.put(f"scattered-{bucket}", file)
+    def take(self, regions: Regions, bucket: int) -> None:
+        """Copy a bucket's rows as they were scattered."""
+        first, stop = regions.first[bucket : bucket + 2].tolist()
+        with tempfile.TemporaryFile() as file:
+            for rows in regions.chunks(first, stop - first, _PIECE):
+                file.write(rows.view(np.uint8).data)
+            self.share.put(f"scattered-{bucket}", file)
 
     def replaced(self) -> SharedRegions:
         """Give the rows after every bucket was replaced."""

@@ -140,6 +140,14 @@ from pathlib import Path
 from pointbuild import BuildOptions, build_model
 from pointbuild.cluster import Cluster
 from pointbuild.progress import Silent
+from pointbuild.share import SharedRegions
+
+take = SharedRegions.take
+def dying(self, regions, bucket):
+    take(self, regions, bucket)
+    if sys.argv[3] == "share" and bucket == 4:
+        os.kill(os.getpid(), signal.SIGKILL)
+SharedRegions.take = dying
 
 class Killing(Silent):
     now = ""
@@ -155,7 +163,7 @@ build_model([Path(sys.argv[1])], Path(sys.argv[2]), options, Killing(), clock=ti
 """
 
 
-@pytest.mark.parametrize("stage", ["partition", "encode", "write"])
+@pytest.mark.parametrize("stage", ["share", "partition", "encode", "write"])
 def test_a_builder_killed_in_the_middle_goes_on(stage: str, points: PointBatch, tmp_path: Path) -> None:
     scan, out = tmp_path / "scan.npz", tmp_path / "m.lpc"
     np.savez(scan, xyz=points.xyz, **points.attributes)
