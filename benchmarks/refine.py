@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pointview.budget import tolerance_for_budget
+from pointview.budget import allowance
 from pointview.camera import Camera
 from pointview.refine import refine
 
@@ -102,7 +102,7 @@ def main() -> None:
             for label, here in (("", resident), (", 10% missing", some)):
                 cut = refine(index, camera, tolerance, here)
                 took = milliseconds(refine, index, camera, tolerance, here, priority="error")
-                counted = milliseconds(tolerance_for_budget, index, camera, cut.splats // 2, here, at_least=tolerance)
+                counted = milliseconds(allowance, index, camera, cut.splats // 2, here, at_least=tolerance)
                 print(
                     f"{name + label:36} {tolerance:5g} {len(cut.nodes):7d} {cut.splats / 1e6:8.2f} {len(cut.wants):6d}"
                     f" {took:10.2f} {counted:9.2f}"

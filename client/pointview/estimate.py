@@ -171,7 +171,9 @@ async def estimate(
         size = view_bytes(index, cut.nodes, scheduler)
         seconds = None
         if rate is not None and rtt is not None:
-            seconds = round(link_seconds(size, rate, rtt, scheduler), 3)
+            # A view within the first request is there as soon as its last cloud is.
+            last = int(np.max(index.offset[cut.nodes] + index.size[cut.nodes], initial=index.header.page0))
+            seconds = round(link_seconds(min(size, last), rate, rtt, scheduler), 3)
         return Estimate(
             tolerance=options.tolerance,
             bytes=size,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pointstream.layer import AccessLayer, LayerOptions
 from pointstream.stores import open_store
 
-from .budget import tolerance_for_budget
+from .budget import allowance, refine_within
 from .camera import Camera
 from .refine import Cut, refine
 from .render import Backend, Frame, Kind, Style, open_backend
@@ -158,10 +158,11 @@ async def _settle(
 
 def cut_of(layer: AccessLayer, options: StillOptions, hidden: NDArray[np.bool_] | None = None) -> Cut:
     """Compute the cut of what is here; a budget counts what is known, so that it settles on what will be here."""
-    camera, tolerance = camera_of(layer, options), options.tolerance
+    camera, tolerance, index = camera_of(layer, options), options.tolerance, layer.index
     one_sided = not options.style.two_sided
-    if options.budget is not None:
-        tolerance = tolerance_for_budget(
-            layer.index, camera, options.budget, layer.index.known, at_least=tolerance, cull_backfaces=one_sided
-        )
-    return refine(layer.index, camera, tolerance, layer.resident, cull_backfaces=one_sided, hidden=hidden)
+    if options.budget is None:
+        return refine(index, camera, tolerance, layer.resident, cull_backfaces=one_sided, hidden=hidden)
+    within = allowance(
+        index, camera, options.budget, index.known, at_least=tolerance, cull_backfaces=one_sided, hidden=hidden
+    )
+    return refine_within(index, camera, within, layer.resident, cull_backfaces=one_sided, hidden=hidden)

@@ -122,8 +122,8 @@ def axis_view(view: Viewpoint, bounds: ArrayLike, axis: str, vertical: Vector) -
     framed = _framed(view, bounds, backward, up)
     if up == vertical:
         return framed
-    # Almost from above: with the model's vertical as up, orbiting goes on as a turntable.
-    tilt = math.sin(POLE)
+    # Almost from above or below: with the model's vertical as up, orbiting goes on as a turntable.
+    tilt = math.sin(POLE) * float(np.dot(backward, vertical))
     backward = _vector(np.array(backward) * math.cos(POLE) - np.array(up) * tilt)
     return _framed(view, bounds, backward, vertical)
 

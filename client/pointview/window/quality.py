@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pointview.budget import tolerance_for_budget
+from pointview.budget import allowance, refine_within
 from pointview.feedback import Feedback
 from pointview.refine import Cut, refine
 
@@ -39,11 +39,11 @@ class Quality:
         tolerance, one_sided = settings.tolerance, not settings.two_sided
         if settings.steady:
             tolerance = max(tolerance, (self.moving if moving else self.resting).tolerance)
-        if settings.limited:
-            tolerance = tolerance_for_budget(
-                mirror.index, camera, settings.budget, mirror.index.known, at_least=tolerance, cull_backfaces=one_sided
-            )
-        return refine(mirror.index, camera, tolerance, mirror.resident, cull_backfaces=one_sided)
+        if not settings.limited:
+            return refine(mirror.index, camera, tolerance, mirror.resident, cull_backfaces=one_sided)
+        index = mirror.index
+        within = allowance(index, camera, settings.budget, index.known, at_least=tolerance, cull_backfaces=one_sided)
+        return refine_within(index, camera, within, mirror.resident, cull_backfaces=one_sided)
 
     def took(self, seconds: float, settings: Settings, *, moving: bool) -> bool:
         """Take in what a frame took; True if a camera at rest should be drawn again, with another tolerance."""

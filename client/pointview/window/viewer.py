@@ -12,7 +12,7 @@ import numpy as np
 from lpc.errors import LpcError
 from pointview.camera import Camera
 from pointview.colouring import MODES, available_modes
-from pointview.render.picture import save_png
+from pointview.render.picture import save_picture
 
 from .controls import Viewpoint, vertical_of
 from .inputs import Inputs, Scene, moved
@@ -219,7 +219,7 @@ class Viewer:
         if self.frame is None:
             return
         path = free_name(self.options.folder, self._stem, ".png")
-        self._try(lambda: save_png(shown(self.frame, self.settings), path) if self.frame else None, path)
+        self._try(lambda: save_picture(shown(self.frame, self.settings), path) if self.frame else None, path)
 
     def toggle_recording(self) -> None:
         """Start to record the path of the camera, or write what was recorded."""
