@@ -13,7 +13,7 @@ import numpy as np
 
 from pointview import splats
 
-from . import kernels, shading
+from . import kernels, picture_kernels, shading
 from .arena import Arena
 from .backend import Frame, Style, Take
 from .pack import Packer
@@ -89,11 +89,13 @@ class CpuBackend:
 
         def dim(worker: int) -> None:
             strength = style.edl_strength * camera.focal
-            kernels.eye_dome(rgb, depth, side, *rows(worker), strength, shading.NEIGHBOUR, shading.DARKEST)
+            picture_kernels.eye_dome(rgb, depth, side, *rows(worker), strength, shading.NEIGHBOUR, shading.DARKEST)
 
         def close(worker: int) -> None:
             largest = min(splats.LARGEST_HOLE, math.ceil(splats.HOLE * side.max()))
-            kernels.close_holes(depth, side, source, *rows(worker), camera.focal, splats.HOLE, largest, splats.WALLS)
+            picture_kernels.close_holes(
+                depth, side, source, *rows(worker), camera.focal, splats.HOLE, largest, splats.WALLS
+            )
 
         self._in_parallel(splat)
         self._in_parallel(resolve)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import kernels
+from . import kernels, picture_kernels
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -39,5 +39,7 @@ def pixels_by_cell(depth: NDArray[np.float32], cut: Cut, camera: Camera) -> NDAr
     counts = np.zeros((len(cut.nodes), 2), dtype=np.int64)
     if cut.places is not None and len(places):
         eye = (np.array(camera.eye) - cut.places.corner[0]).astype(np.float32)
-        kernels.count_cells(counts, depth, places, halvings, eye, camera.rotation().astype(np.float32), camera.focal)
+        picture_kernels.count_cells(
+            counts, depth, places, halvings, eye, camera.rotation().astype(np.float32), camera.focal
+        )
     return counts

@@ -1,4 +1,4 @@
-// Holes of the sampling take the look of the wall around them: the same rule as kernels.close_holes.
+// Holes of the sampling take the look of the wall around them: the same rule as picture_kernels.close_holes.
 
 uniform sampler2D picture;
 uniform sampler2D depths;   // depth, side (negative: starved)

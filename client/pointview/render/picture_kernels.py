@@ -1,0 +1,171 @@
+"""Compiled loops over the pixels of a finished picture: its lighting, its holes, and the cells of the tree it shows.
+
+Nothing here knows the kernels of the samples, so the cache of compiled code needs to see no other file.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numba
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+DIRECTIONS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1))
+"""Of the eight neighbours; opposite ones first, which decide soonest."""
+
+F = np.float32
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def eye_dome(
+    rgb: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    side: NDArray[np.float32],
+    top: int,
+    bottom: int,
+    strength: float,
+    sides: float,
+    darkest: float,
+) -> None:  # pragma: no cover - compiled
+    """Darken `rgb` in place by eye-dome lighting (see `shading`).
+
+    Parameters
+    ----------
+    strength : float
+        `Style.edl_strength` times the focal length, pixels.
+    sides : float
+        Distance of the neighbours, sides of the pixel's splat.
+    darkest : float
+        Least factor.
+    """
+    height, width = depth.shape
+    for row in range(top, bottom):
+        for column in range(width):
+            here = depth[row, column]
+            if here == np.inf:
+                continue
+            inverse = F(1.0) / here
+            away = max(int(side[row, column] * F(sides) + F(0.5)), 1)
+            # The sum of logarithms is the logarithm of a product: one call for eight neighbours.
+            product = F(1.0)
+            for i in range(-1, 2):
+                y = row + i * away
+                if y < 0 or y >= height:
+                    continue
+                for j in range(-1, 2):
+                    x = column + j * away
+                    if x < 0 or x >= width or (i == 0 and j == 0):
+                        continue
+                    ratio = depth[y, x] * inverse
+                    if ratio < F(1.0):
+                        product *= max(ratio, F(1e-4))
+            shade = F(darkest + (1.0 - darkest) * math.exp(strength / (8.0 * away) * math.log(product)))
+            for channel in range(3):
+                rgb[row, column, channel] = np.uint8(F(rgb[row, column, channel]) * shade + F(0.5))
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def close_holes(
+    depth: NDArray[np.float32],
+    side: NDArray[np.float32],
+    source: NDArray[np.int32],
+    top: int,
+    bottom: int,
+    focal: float,
+    reach: float,
+    largest: int,
+    walls: int,
+) -> None:  # pragma: no cover - compiled
+    """Say for each pixel of the rows `top` to `bottom` which pixel it shows: itself, or the wall of the hole it is in.
+
+    Parameters
+    ----------
+    depth, side : (h, w) float32
+    source : (h, w) int32
+        Result: row * width + column.
+    reach : float
+        A wall is at most this many sides of its own splat away.
+    largest : int
+        And at most this many pixels.
+    walls : int
+        Directions, of eight, in which a hole has walls.
+    """
+    height, width = depth.shape
+    for row in range(top, bottom):
+        for column in range(width):
+            here = depth[row, column]
+            best, nearest, found = row * width + column, largest + 1, 0
+            for direction in range(8):
+                if found + 8 - direction < walls:
+                    break
+                dx, dy = DIRECTIONS[direction]
+                step = 1
+                while step <= largest:
+                    x, y = column + step * dx, row + step * dy
+                    if x < 0 or x >= width or y < 0 or y >= height:
+                        break
+                    wall = depth[y, x]
+                    if wall < here:
+                        wide = side[y, x]
+                        if step <= max(F(reach) * wide, F(1.0)) and wall * (F(1.0) + wide / F(focal)) < here:
+                            found += 1
+                            if step < nearest:
+                                nearest, best = step, y * width + x
+                            break
+                    step += 1 if step < 4 else step // 2
+            source[row, column] = best if found >= walls else row * width + column
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def count_cells(
+    counts: NDArray[np.int64],
+    depth: NDArray[np.float32],
+    places: NDArray[Any],
+    halvings: NDArray[Any],
+    eye: NDArray[np.float32],
+    rotation: NDArray[np.float32],
+    focal: float,
+) -> None:  # pragma: no cover - compiled
+    """Add the covered pixels to the halves of cells that their surface lies in, and to all cells around these.
+
+    Parameters
+    ----------
+    counts : (n, 2) int64
+        For the lower and the upper half of the cell of each node of `places`.
+    depth : (h, w) float32
+    eye : (3,) float32
+        Relative to the corner of the root's cell.
+    """
+    height, width = depth.shape
+    inverse = F(1.0 / focal)
+    for line in range(height):
+        up = (F(0.5) * F(height) - F(line) - F(0.5)) * inverse
+        for column in range(width):
+            here = depth[line, column]
+            if here == np.inf:
+                continue
+            right = (F(column) + F(0.5) - F(0.5) * F(width)) * inverse
+            x = eye[0] + here * (rotation[0, 0] * right + rotation[1, 0] * up + rotation[2, 0])
+            y = eye[1] + here * (rotation[0, 1] * right + rotation[1, 1] * up + rotation[2, 1])
+            z = eye[2] + here * (rotation[0, 2] * right + rotation[1, 2] * up + rotation[2, 2])
+            row, level = 0, 0
+            while row >= 0:
+                axis, half, place = halvings[level].axis, halvings[level].half, places[row]
+                along = x if axis == 0 else (y if axis == 1 else z)
+                if along >= half:
+                    counts[row, 1] += 1
+                    row = place.upper
+                    if axis == 0:
+                        x -= half
+                    elif axis == 1:
+                        y -= half
+                    else:
+                        z -= half
+                else:
+                    counts[row, 0] += 1
+                    row = place.lower
+                level += 1
