@@ -57,7 +57,7 @@ async def jump(data: bytes, every: float, capacity: int, seed: int) -> str:
         if loop.time() - jumped >= every:
             camera, jumped = close_up(layer, draw), loop.time()
         cut = refine(layer.index, camera, 1.0, layer.resident)
-        layer.end_frame(cut.wants, pinned=cut.nodes)
+        layer.end_frame(cut.asks, pinned=cut.nodes)
         wants += len(cut.wants)
         await asyncio.sleep(FRAME)
     stats = layer.stats

@@ -18,7 +18,7 @@ Nothing here does I/O or reads a clock; equal arguments give equal cuts.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -37,6 +37,12 @@ if TYPE_CHECKING:
 Nodes = NDArray[np.int64]
 Priority = Literal["index", "error"]
 SplatRule = Literal["place", "paper"]
+
+FEW = 64
+"""Wants that may not fill a round trip: up to here what follows them is looked for."""
+
+LEVELS_AHEAD = 3
+"""Levels below the wants that are looked at."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,6 +70,9 @@ class Cut:
         Nodes drawn grown because a visible child is missing.
     wants : (m,) int64
         Nodes that would refine the picture, most urgent first; those that are not known yet stand for their page.
+    ahead : (k,) int64
+        Nodes that will be wanted once `wants` are here, nearest levels first: they keep the link busy for a round trip
+        in which nothing else is wanted. Empty where the wants alone do that.
     pages : (p,) int64
         Pages of the wants that are not known yet, most urgent first.
     culled : Culled
@@ -90,6 +99,12 @@ class Cut:
     max_spacing_px: float
     places: Places | None
     depth_range: tuple[float, float]
+    ahead: Nodes = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+    @property
+    def asks(self) -> Nodes:
+        """What to ask the access layer for: the wants, then what follows them."""
+        return np.concatenate([self.wants, self.ahead])
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,6 +260,7 @@ def refine(
     grown = spacing > 0
     splat_px[grown] = CLOSING * spacing_px[grown] * (spacing[grown] / index.spacing[nodes[grown]])
     wants, pages = _missing(index, camera, tolerance, levels, priority)
+    ahead = _ahead(replace(sieve), tolerance, levels, resident) if 0 < len(wants) <= FEW else wants[:0]
     return Cut(
         nodes=nodes,
         spacing=spacing.astype(np.float32),
@@ -257,36 +273,8 @@ def refine(
         max_spacing_px=min(float(np.max(spacing_px[ends], initial=0.0)), float(max(camera.width, camera.height))),
         places=laid_out,
         depth_range=camera.depth_range(index.center[nodes], index.radius[nodes]),
+        ahead=ahead,
     )
-
-
-def drawn_up_to(
-    index: IndexTree, camera: Camera, tolerance: float, resident: NDArray[np.bool_], *, cull_backfaces: bool = True
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Tell which tolerances draw which clouds, in one traversal.
-
-    A node is drawn when all its ancestors are coarser than the tolerance: up to the least projected spacing among them.
-
-    Returns
-    -------
-    limit : (n,) float64
-        Largest tolerance that draws the cloud, pixels; infinite for the root. Clouds that no tolerance from `tolerance`
-        on draws are left out.
-    samples : (n,) int64
-        Samples of the cloud.
-    """
-    limits: list[NDArray[np.float64]] = []
-    samples: list[NDArray[np.int64]] = []
-    limit = np.full(1, np.inf)
-    if index.known[0] and resident[0]:
-        for level in _descend(_Sieve(index, camera, cull_backfaces), tolerance, resident):
-            limits.append(limit)
-            samples.append(index.samples[level.nodes])
-            below = np.minimum(limit, level.spacing_px)
-            limit = np.repeat(below, 2).reshape(-1, 2)[level.drawn]
-    if not limits:
-        return np.empty(0), np.empty(0, dtype=np.int64)
-    return np.concatenate(limits), np.concatenate(samples)
 
 
 def _shown_spacing(levels: list[_Level], spacings: list[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
@@ -318,6 +306,28 @@ def _missing(
     pages = nodes[~index.known[nodes]] // index.header.page_nodes
     _, first = np.unique(pages, return_index=True)
     return nodes, pages[np.sort(first)]
+
+
+def _ahead(sieve: _Sieve, tolerance: float, levels: list[_Level], resident: NDArray[np.bool_]) -> Nodes:
+    """Nodes below the missing ones that the view will refine to, as far as the index is known.
+
+    Found by the tests of `_descend`, so nothing is asked for that the finished cut would not draw. `sieve` is a copy:
+    what it drops here is not counted.
+    """
+    index = sieve.index
+    nodes = np.concatenate([level.children[level.missing] for level in levels])
+    spacing_px = np.concatenate([level.child_spacing_px[level.missing] for level in levels])
+    found: list[Nodes] = []
+    for _ in range(LEVELS_AHEAD):
+        children = index.children[nodes[index.known[nodes] & (spacing_px >= tolerance)]].astype(np.int64).ravel()
+        children = np.sort(children[children >= 0])
+        known = index.known[children]
+        visible, child_spacing_px = sieve.look(children[known])
+        unknown = children[~known]
+        unknown = unknown[sieve.uncovered(unknown, np.ones(len(unknown), dtype=bool))]
+        nodes, spacing_px = children[known][visible], child_spacing_px[visible]
+        found.append(np.sort(np.concatenate([nodes[~resident[nodes]], unknown])))
+    return np.concatenate(found)
 
 
 def _error_per_byte(

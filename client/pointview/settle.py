@@ -51,7 +51,7 @@ async def settle(
     seen, since = -1, clock()
     while True:
         cut = look(layer)
-        layer.end_frame(cut.wants, pinned=cut.nodes)
+        layer.end_frame(cut.asks, pinned=cut.nodes)
         if progress is not None:
             progress(cut)
         stats = layer.stats

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support import models
 
 from pointview.camera import Camera
-from pointview.refine import Cut, refine
+from pointview.refine import FEW, Cut, refine
 from pointview.splats import CLOSING, LARGEST
 
 
@@ -130,6 +130,26 @@ def test_every_cut_is_closed_and_asks_only_for_what_is_missing(ring, eye, tolera
     assert len(np.unique(cut.wants)) == len(cut.wants)
     assert (cut.splat_px >= 1).all()
     assert (cut.splat_px <= LARGEST).all()
+
+
+@settings(max_examples=30, deadline=None)
+@given(eye=eyes, tolerance=st.floats(0.3, 40), seed=st.integers(0, 5))
+def test_what_is_asked_ahead_is_drawn_in_the_end(ring, eye, tolerance, seed):
+    index, camera = ring.index, camera_at(eye)
+    resident = np.random.default_rng(seed).random(ring.header.nodes) < 0.8
+    resident[0] = True
+    cut = refine(index, camera, tolerance, resident)
+    assert cut.asks.tolist() == cut.wants.tolist() + cut.ahead.tolist()
+    assert len(np.unique(cut.asks)) == len(cut.asks)
+    assert not resident[cut.asks].any()
+    whole = refine(index, camera, tolerance, np.ones_like(resident))
+    assert set(cut.asks.tolist()) <= set(whole.nodes.tolist())
+    if 0 < len(cut.wants) <= FEW:
+        below = set(index.parent[cut.ahead].tolist())
+        children = index.children[cut.wants]
+        wanted = [n for n in np.intersect1d(children[children >= 0], whole.nodes).tolist() if not resident[n]]
+        assert set(wanted) <= set(cut.ahead.tolist())
+        assert bool(below) == bool(len(cut.ahead))
 
 
 def test_no_node_that_shows_a_sample_is_culled(ball, ring):

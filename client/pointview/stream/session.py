@@ -275,7 +275,7 @@ class _Session:
         layer, recording = self.layer, self.recording
         camera = self.camera_at(layer.header, t)
         cut = self._refine(camera)
-        layer.end_frame(cut.wants, pinned=cut.nodes)
+        layer.end_frame(cut.asks, pinned=cut.nodes)
         recording.frames += 1
         if len(cut.nodes):
             if recording.first_picture_s is None:

@@ -146,7 +146,7 @@ class Viewer:
         camera, first = self.view.camera, self.frame is None
         start = self._clock()
         self.cut = self.quality.cut(self.mirror, camera, self.settings, moving=moving)
-        self.feed.ask(self.mirror.build, self.cut.wants, self.cut.nodes)
+        self.feed.ask(self.mirror.build, self.cut.asks, self.cut.nodes)
         self.frame = self.painter.draw(self.cut, self.mirror, camera, self.settings)
         seconds = self._clock() - start
         # What compiles or uploads says nothing about the next frame.
