@@ -62,6 +62,7 @@ def sphere_index() -> Any:
         cone_angle=np.concatenate(angle).astype(np.float32),
         children=children.astype(np.int32),
         parent=np.where(numbers > 0, (numbers - 1) // 2, -1).astype(np.int32),
+        level=levels.astype(np.uint8),
     )
 
 
