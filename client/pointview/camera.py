@@ -139,10 +139,6 @@ class Camera:
         """Pixels of a length of one unit at a depth of one unit."""
         return self.height / (2 * math.tan(math.radians(self.fov_y) / 2))
 
-    def pixels_per_unit_at(self, distance: float) -> float:
-        """Pixels of a length of one unit at that distance; infinite at or behind the eye."""
-        return self.focal / distance if distance > 0 else math.inf
-
     def rotation(self) -> NDArray[np.float64]:
         """Rows right, up and forward, (3, 3): `rotation() @ (x - eye)` is x in camera space."""
         eye, target, up = np.array(self.eye), np.array(self.target), np.array(self.up)
@@ -200,23 +196,6 @@ class Camera:
         far *= 1.0 + 1e-5
         near = max(float(np.min(depth - radius)) * (1.0 - 1e-5), far * MIN_NEAR)
         return near, far
-
-    def view_matrix(self) -> NDArray[np.float64]:
-        """Model space to the space of OpenGL's eye (x right, y up, z backward), (4, 4) float64."""
-        matrix = np.eye(4)
-        matrix[:3, :3] = self.rotation() * np.array([[1.0], [1.0], [-1.0]])
-        matrix[:3, 3] = -matrix[:3, :3] @ np.array(self.eye)
-        return matrix
-
-    def projection_matrix(self, near: float, far: float) -> NDArray[np.float64]:
-        """OpenGL's perspective matrix for two positive distances, (4, 4) float64."""
-        matrix = np.zeros((4, 4))
-        matrix[1, 1] = 1 / math.tan(math.radians(self.fov_y) / 2)
-        matrix[0, 0] = matrix[1, 1] * self.height / self.width
-        matrix[2, 2] = (far + near) / (near - far)
-        matrix[2, 3] = 2 * far * near / (near - far)
-        matrix[3, 2] = -1
-        return matrix
 
 
 def _is_number(value: object) -> bool:

@@ -89,18 +89,22 @@ def read_link(text: str) -> Profile:
         raise click.BadParameter(str(error), param_hint="--link") from error
 
 
-@click.command()
-@click.argument("model")
-@click.argument("out", metavar="OUT.png", type=click.Path(dir_okay=False, path_type=Path))
-@click.option("--size", type=SizeType(), default="1024x768", show_default=True, help="Picture size in pixels.")
-@click.option("--view", type=ViewType(), help="Where to look from; without it the whole model is framed.")
-@click.option(
+TOLERANCE = click.option(
     "--tolerance",
     type=POSITIVE,
     default=1.0,
     show_default=True,
     help="Spacing of samples on the screen that is fine enough, pixels.",
 )
+"""The option of every command that refines."""
+
+
+@click.command()
+@click.argument("model")
+@click.argument("out", metavar="OUT.png", type=click.Path(dir_okay=False, path_type=Path))
+@click.option("--size", type=SizeType(), default="1024x768", show_default=True, help="Picture size in pixels.")
+@click.option("--view", type=ViewType(), help="Where to look from; without it the whole model is framed.")
+@TOLERANCE
 @click.option("--budget", type=COUNT, help="Most splats; coarser where the tolerance needs more.")
 @click.option("--backend", type=click.Choice(["auto", "gl", "cpu"]), default="auto", show_default=True)
 @click.option("--two-sided", is_flag=True, help="Show surfaces from behind too: for normals that may point inward.")

@@ -9,23 +9,16 @@ from typing import Any
 
 import click
 
-from pointstream.arguments import POSITIVE
 from pointstream.cli import CACHE, choose_cache
 
-from .cli import SizeType, ViewType, Waiting, read_link
+from .cli import TOLERANCE, SizeType, ViewType, Waiting, read_link
 
 
 @click.command()
 @click.argument("model")
 @click.option("--size", type=SizeType(), default="1024x768", show_default=True, help="Picture size in pixels.")
 @click.option("--view", type=ViewType(), help="Where to look from; without it the whole model is framed.")
-@click.option(
-    "--tolerance",
-    type=POSITIVE,
-    default=1.0,
-    show_default=True,
-    help="Spacing of samples on the screen that is fine enough, pixels.",
-)
+@TOLERANCE
 @click.option(
     "--link", metavar="none|adsl|lan|RATE[,RTT]", help="The line to reckon with; what is measured if not given."
 )

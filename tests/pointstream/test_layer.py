@@ -3,56 +3,27 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 from support.frames import FRAME, check_clouds, fill, frame, whole_index
-from support.hosts import KINDS, PATH, origin_of, virtual_store, with_store
+from support.hosts import KINDS, origin_of, virtual_store, with_store
+from support.layers import opened, over_line
 
 from lpc.errors import Corrupt, LpcError, NotAModel, NotFound, RangesUnsupported, Truncated, Unavailable
 from lpc.header import HEADER_PROBE, parse_header
 from pointlink import virtual
-from pointlink.faults import Flip, IgnoreRange, OtherEtag, Reset, Short, Stall, Status
+from pointlink.faults import Flip, IgnoreRange, Reset, Short, Stall, Status
 from pointlink.profiles import ADSL, LAN
-from pointlink.resources import Resource
-from pointstream.layer import AccessLayer, LayerOptions
+from pointstream.layer import AccessLayer
 from pointstream.stores import MemoryStore
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
     from pathlib import Path
 
     from pointlink.origin import Origin
-    from pointlink.profiles import Profile
     from pointstream.stores import Store
-
-
-@asynccontextmanager
-async def opened(store: Store, **options: Any) -> AsyncIterator[AccessLayer]:
-    layer = await AccessLayer.open(store, options=LayerOptions(**options))
-    try:
-        yield layer
-    finally:
-        await layer.close()
-
-
-def over_line(
-    data: bytes,
-    check: Callable[[AccessLayer, Origin], Any],
-    profile: Profile = ADSL,
-    fault: Any = None,
-    **options: Any,
-) -> None:
-    """Run a check on a layer at the end of a simulated line."""
-
-    async def run() -> None:
-        origin = origin_of(data, fault)
-        async with virtual_store(origin, profile) as store, opened(store, **options) as layer:
-            await check(layer, origin)
-
-    virtual.run(run())
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -350,85 +321,6 @@ def test_a_host_that_turns_us_away_later_is_not_asked_again(model: bytes) -> Non
         assert len(origin.log) <= 7
         assert (layer.resident == here).all()
         assert "403" in layer.stats.errors[0].text
-
-    over_line(model, check)
-
-
-def test_a_new_build_takes_the_place_of_the_old_one_in_one_step(model: bytes, other_model: bytes) -> None:
-    async def check(layer: AccessLayer, origin: Origin) -> None:
-        await layer.idle()
-        frame(layer)
-        await asyncio.sleep(FRAME)
-        origin.resources[PATH] = Resource.from_bytes(other_model)  # type: ignore[index]
-        digests = {parse_header(model).digest: model, parse_header(other_model).digest: other_model}
-        for _ in range(200):
-            frame(layer)
-            check_clouds(layer, digests[layer.header.digest])
-            await asyncio.sleep(FRAME)
-        assert layer.header == parse_header(other_model)
-        assert layer.resident.all()
-        assert len(layer.resident) == layer.header.nodes
-        assert layer.stats.build == 2
-        assert [report.cause for report in layer.stats.errors] == ["model"]
-
-    over_line(model, check)
-
-
-def test_a_new_build_of_equal_length_and_tag_is_found_by_its_pages(model: bytes) -> None:
-    """nginx and Caddy give such twins the same tag: the build tag of the next page tells them apart."""
-    from dataclasses import replace as change
-
-    header = parse_header(model)
-    twin_header = change(header, digest=header.digest[::-1])
-    index = whole_index(model)
-    twin = bytearray(twin_header.to_bytes() + model[header.page0 :])
-    assert len(twin) == len(model)
-    for page in range(len(index.page_loaded)):
-        start, stop = index.page_range(page).start, index.page_range(page).stop
-        twin[start : start + 8] = twin_header.tag
-        import zlib
-
-        crc = zlib.crc32(twin[start + 24 : stop], zlib.crc32(twin[start : start + 20]))
-        twin[start + 20 : start + 24] = crc.to_bytes(4, "little")
-
-    async def check(layer: AccessLayer, origin: Origin) -> None:
-        await layer.idle()
-        old = origin.resources[PATH]
-        origin.resources[PATH] = change(old, read=lambda a, b: bytes(twin[a:b]))  # type: ignore[index]
-        await fill(layer)
-        assert layer.header.digest == twin_header.digest
-        assert layer.resident.all()
-        assert layer.stats.build == 2
-
-    over_line(model, check)
-
-
-def test_tags_that_change_with_every_reply_are_not_trusted_for_long(model: bytes) -> None:
-    async def check(layer: AccessLayer, origin: Origin) -> None:
-        await fill(layer)
-        assert layer.resident.all()
-        assert layer.stats.build == 1
-        assert len([exchange for exchange in origin.log if exchange.stop == HEADER_PROBE]) == 2
-
-    over_line(model, check, fault=lambda number: OtherEtag(etag=f'"{number}"'))
-
-
-def test_a_host_that_changes_for_ever_is_given_up(model: bytes, other_model: bytes) -> None:
-    async def check(layer: AccessLayer, origin: Origin) -> None:
-        turn = 0
-
-        def swap(number: int) -> None:
-            nonlocal turn
-            turn += 1
-            data = (model, other_model)[turn % 2]
-            origin.resources[PATH] = Resource.from_bytes(data)  # type: ignore[index]
-
-        origin.fault = swap  # type: ignore[assignment]
-        for _ in range(300):
-            frame(layer)
-            await asyncio.sleep(FRAME)
-        assert [report.cause for report in layer.stats.errors][-1] == "host"
-        assert len(origin.log) < 60
 
     over_line(model, check)
 

@@ -23,8 +23,6 @@ def vectors(limit: float) -> st.SearchStrategy[tuple[float, float, float]]:
 def test_a_view_by_hand():
     camera = Camera.from_view(VIEW, width=200, height=100)
     assert camera.focal == pytest.approx(50)
-    assert camera.pixels_per_unit_at(10) == pytest.approx(5)
-    assert camera.pixels_per_unit_at(0) == math.inf
     pixel, depth = camera.project([[0, 0, 0], [1, 2, 0], [-20, 10, 0]])
     np.testing.assert_allclose(pixel, [[100, 50], [105, 40], [0, 0]], atol=1e-9)
     np.testing.assert_allclose(depth, [10, 10, 10])
@@ -35,8 +33,26 @@ def test_view_and_back():
     assert Camera.from_view(camera.to_view(), width=3, height=2) == camera
 
 
+def clip_coordinates(camera: Camera, point: tuple[float, float, float]) -> np.ndarray:
+    """What OpenGL's look-at and perspective matrices make of a point, (4,)."""
+    near, far = 0.01, 1000.0
+    view = np.eye(4)
+    view[:3, :3] = camera.rotation() * np.array([[1.0], [1.0], [-1.0]])
+    view[:3, 3] = -view[:3, :3] @ np.array(camera.eye)
+    tall = 1 / math.tan(math.radians(camera.fov_y) / 2)
+    projection = np.array(
+        [
+            [tall * camera.height / camera.width, 0, 0, 0],
+            [0, tall, 0, 0],
+            [0, 0, (far + near) / (near - far), 2 * far * near / (near - far)],
+            [0, 0, -1, 0],
+        ]
+    )
+    return projection @ view @ np.array([*point, 1.0])
+
+
 @given(vectors(100), vectors(100), vectors(100), st.floats(5, 150), vectors(50))
-def test_matrices_agree_with_project(eye, target, up, fov_y, point):
+def test_projecting_agrees_with_matrices(eye, target, up, fov_y, point):
     if math.dist(eye, target) < 1e-3 or math.hypot(*up) < 1e-3:
         return
     camera = Camera(eye=eye, target=target, up=up, fov_y=fov_y, width=640, height=360)
@@ -46,7 +62,7 @@ def test_matrices_agree_with_project(eye, target, up, fov_y, point):
     pixel, depth = camera.project([point])
     if depth[0] < 0.01:
         return
-    clip = camera.projection_matrix(0.01, 1000.0) @ camera.view_matrix() @ np.array([*point, 1.0])
+    clip = clip_coordinates(camera, point)
     assert clip[3] == pytest.approx(depth[0], rel=1e-9, abs=1e-9)
     x, y = clip[0] / clip[3], clip[1] / clip[3]
     np.testing.assert_allclose(pixel[0], [(x + 1) * 320, (1 - y) * 180], rtol=1e-7, atol=1e-5)

@@ -9,8 +9,8 @@ from typing import Any
 
 import click
 
-from pointstream.arguments import POSITIVE, Number
-from pointview.cli import SizeType, ViewType, read_link
+from pointstream.arguments import Number
+from pointview.cli import TOLERANCE, SizeType, ViewType, read_link
 
 LONGEST = 3600.0
 """Seconds: a run keeps two pictures a second in memory."""
@@ -31,13 +31,7 @@ LONGEST = 3600.0
 @click.option("--path", type=click.Path(path_type=Path, dir_okay=False), help="PATH.json: views at times.")
 @click.option("--clock", default="real", show_default=True, type=click.Choice(["real", "virtual"]))
 @click.option("--size", type=SizeType(), default="1024x768", show_default=True, help="Picture size in pixels.")
-@click.option(
-    "--tolerance",
-    default=1.0,
-    show_default=True,
-    type=POSITIVE,
-    help="Spacing of samples on the screen that is fine enough, pixels.",
-)
+@TOLERANCE
 @click.option(
     "--priority",
     default="error",

@@ -12,20 +12,14 @@ import click
 
 from pointstream.arguments import COUNT, POSITIVE
 from pointstream.cli import CACHE, choose_cache
-from pointview.cli import MOST_THREADS, SizeType, ViewType, read_link
+from pointview.cli import MOST_THREADS, TOLERANCE, SizeType, ViewType, read_link
 
 
 @click.command()
 @click.argument("model", required=False)
 @click.option("--size", type=SizeType(), default="1280x800", show_default=True, help="Size of the window.")
 @click.option("--view", type=ViewType(), help="Where to look from first; without it the whole model is framed.")
-@click.option(
-    "--tolerance",
-    type=POSITIVE,
-    default=1.0,
-    show_default=True,
-    help="Spacing of samples on the screen that is fine enough, pixels.",
-)
+@TOLERANCE
 @click.option("--budget", type=COUNT, help="Most splats.")
 @click.option("--backend", type=click.Choice(["auto", "gl", "cpu"]), default="auto", show_default=True)
 @click.option("--link", metavar="none|adsl|lan|RATE[,RTT]", help="See the model as over this line.")

@@ -103,10 +103,6 @@ class Screen:
         """What OpenGL calls the graphics hardware of the window."""
         return str(self._context.info["GL_RENDERER"])
 
-    def ask_to_close(self) -> None:
-        """Make `closing` true."""
-        glfw.set_window_should_close(self._window, True)
-
     def rename(self, title: str) -> None:
         """Give the window another title."""
         glfw.set_window_title(self._window, title)
