@@ -36,6 +36,8 @@ AMBIENT = 0.22
 DIFFUSE = 0.80
 SPECULAR = 0.12
 SHININESS = 16
+UNLIT = 0.80
+"""Factor of the albedo for the samples without normal of a model that has normals."""
 
 NEIGHBOUR = 0.4
 """Distance of the neighbours of eye-dome lighting, sides of a splat: about the spacing of its samples."""
