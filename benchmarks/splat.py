@@ -79,7 +79,7 @@ def cut_of(clouds: list[Cloud], side_px: float, camera: Camera) -> Cut:
         nodes=np.arange(count), spacing=np.full(count, spacing, dtype=np.float32),
         splat_px=np.full(count, side_px, dtype=np.float32),
         starved=np.zeros(count, dtype=bool), wants=np.empty(0, dtype=np.int64), pages=np.empty(0, dtype=np.int64),
-        culled=Culled(), splats=SAMPLES, max_spacing_px=1.0, depth_range=(1.9, 4.1),
+        culled=Culled(), splats=SAMPLES, max_spacing_px=1.0, places=None, depth_range=(1.9, 4.1),
     )  # fmt: skip
 
 
