@@ -72,6 +72,8 @@ class Occlusion:
         self._tested = np.zeros(nodes, dtype=np.int32)  # number of the last test, from 1 on
         self._seen = np.zeros(nodes, dtype=np.int32)
         self._test = 0
+        self._camera: Camera | None = None
+        self._back = np.zeros(nodes, dtype=bool)
         self._trial, self._pause = 0, 0
         self._share = 0.0
 
@@ -107,6 +109,12 @@ class Occlusion:
         now = np.zeros_like(before)
         nodes = children[tested]
         now[nodes] = self._seen[nodes] <= self._test - self._kept
+        # A node on the edge of being seen would come and go for ever: what comes back stays while the camera stands.
+        if camera != self._camera:
+            self._camera = camera
+            self._back[:] = False
+        self._back[seen[before[seen]]] = True
+        now &= ~self._back
         self.hidden = now
         self._judge(len(nodes), int(np.count_nonzero(now)))
         return int(np.count_nonzero(before[seen]))

@@ -95,6 +95,18 @@ def test_hidden_nodes_are_left_out_and_the_picture_stays(onion):
     assert again.nodes.tolist() == cut.nodes.tolist()
 
 
+def test_a_still_camera_comes_to_rest(onion):
+    """What is revealed under a still camera stays: nothing comes and goes for ever, from whatever side."""
+    for eye in ((0.4, -2.5, 1.0), (1.9, 0.7, -0.4), (-1.0, 1.2, 1.9), (0.2, 1.3, 0.1)):
+        viewer, camera = Viewer(onion), camera_at(eye)
+        for _ in range(12):
+            viewer.frame(camera)
+        hidden = viewer.occlusion.hidden.copy()
+        for _ in range(4):
+            viewer.frame(camera)
+            assert np.array_equal(viewer.occlusion.hidden, hidden)
+
+
 def test_hidden_nodes_are_not_wanted(onion):
     viewer, camera = Viewer(onion), camera_at((0.4, -2.5, 1.0))
     for nodes in (1, 8, 30, 60, 100, 140, onion.header.nodes):

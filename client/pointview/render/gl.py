@@ -332,9 +332,10 @@ def _shader(name: str, defines: str = "") -> str:
     """Text of a shader: GLSL with the constants of `splats` and `shading` for @NAME@."""
     text = (files(__package__) / "shaders" / name).read_text(encoding="utf-8")
     kinds = "".join(f"#define {kind} {number}\n" for number, kind in enumerate(("POINT", "SQUARE", "BALL", "DISC")))
+    constants = {**vars(splats), **vars(shading), "EMPTY": EMPTY}
 
     def constant(match: re.Match[str]) -> str:
-        value = EMPTY if match[1] == "EMPTY" else getattr(shading, match[1], None) or getattr(splats, match[1])
+        value = constants[match[1]]
         return str(value) if match[1] in ("WALLS", "LARGEST_HOLE") else f"{float(value):.9e}"
 
     return f"#version 330\n{defines}{kinds}{re.sub('@([A-Z_]+)@', constant, text)}"

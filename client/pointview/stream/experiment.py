@@ -74,7 +74,7 @@ class Experiment:
     tolerance: float
     priority: Priority
     splat_rule: SplatRule = "place"
-    occlusion: Literal["auto", "off"] = "auto"
+    occlusion: Literal["auto", "off"] = "off"
     views: ViewPath | None = None
 
     def camera_at(self, header: Header, t: float) -> Camera:

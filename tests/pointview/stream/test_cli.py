@@ -38,7 +38,7 @@ def test_figures_and_stages_in_plain_lines(small, tmp_path, capsys):
     assert run(small, *given(tmp_path, link="none")) == 0
     said = capsys.readouterr()
     assert [line.split("  ")[0] for line in said.out.splitlines()] == [
-        "first picture", "settled", "received", "link used", "hidden", "report",
+        "first picture", "settled", "received", "link used", "report",
     ]  # fmt: skip
     assert "no limit" in said.out
     assert "\x1b" not in said.out + said.err
