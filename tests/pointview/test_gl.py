@@ -77,6 +77,18 @@ def test_the_cpu_picture(gl, scene, one_draw, two_sided):
     backend.close()
 
 
+@pytest.mark.parametrize("splat", ["square", "round"])
+def test_other_splats(gl, scene, splat):
+    model, camera = scene
+    style, backend, oracle = Style(splat=splat), gl(model.header), CpuBackend(model.header)
+    for tolerance in (1.0, 6.0):
+        cut = refine(model.index, camera, tolerance, model.everything)
+        # They have nearly one depth: where many overlap, more of them tie in the 24 bits of a depth buffer.
+        expected = oracle.draw(cut, model.take, camera, style)
+        assert_same(backend.draw(cut, model.take, camera, style), expected, 3 * SHARE)
+    backend.close()
+
+
 def test_inside_the_model(gl):
     model = models.torus(8000)
     camera = Camera(eye=(1.0, 0.02, 0.03), target=(1.0, 1.0, 0.2), up=(0, 0, 1), width=120, height=90)

@@ -164,11 +164,12 @@ class CpuBackend:
         view = np.zeros(1, dtype=kernels.VIEW)[0]
         view["width"], view["height"], view["focal"] = camera.width, camera.height, camera.focal
         view["near"] = cut.depth_range[0]
-        view["largest"], view["round_from"], view["round"] = splats.LARGEST, splats.ROUND_FROM, splats.ROUND
+        view["largest"], view["round"] = splats.LARGEST, splats.ROUND
+        view["round_from"] = math.inf if style.splat == "square" else splats.ROUND_FROM
         view["bulge"], view["steepest"] = splats.BULGE, splats.STEEPEST
         view["closing"], view["reach"] = splats.CLOSING * camera.focal, splats.REACH
         view["cull"] = self._packer.has_normals and not style.two_sided
-        view["oriented"] = style.oriented
+        view["oriented"] = style.splat == "disc"
         return view
 
     def _light(self, camera: Camera, style: Style) -> Any:

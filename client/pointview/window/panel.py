@@ -13,6 +13,8 @@ from .inputs import AXES, KEYS
 from .settings import BUDGETS, TOLERANCES, Settings
 
 if TYPE_CHECKING:
+    from pointview.render import Splat
+
     from .viewer import Viewer
 
 WIDTH = 24.0
@@ -22,6 +24,9 @@ MODE_NAMES: dict[Mode, str] = {
     "color": "colour", "shading": "shading alone", "height": "height", "intensity": "intensity",
     "classification": "classification", "normal": "normal", "level": "level",
 }  # fmt: skip
+
+SPLAT_NAMES: dict[Splat, str] = {"square": "squares", "round": "round", "disc": "discs in the surface"}
+SPLATS = tuple(SPLAT_NAMES)
 
 
 @dataclass(slots=True)
@@ -129,7 +134,9 @@ def _quality(settings: Settings) -> None:
     if changed:
         settings.frame_seconds = milliseconds / 1e3
     imgui.end_disabled()
-    _, settings.oriented = imgui.checkbox("discs in the surface", settings.oriented)
+    changed, at = imgui.combo("splats", SPLATS.index(settings.splat), list(SPLAT_NAMES.values()))
+    if changed:
+        settings.splat = SPLATS[at]
     _, settings.close_holes = imgui.checkbox("close holes", settings.close_holes)
     _, settings.two_sided = imgui.checkbox("both sides", settings.two_sided)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from pointview.render import Style
+from pointview.render import Splat, Style
 
 if TYPE_CHECKING:
     from pointview.colouring import Mode
@@ -35,7 +35,8 @@ class Settings:
     mode : Mode
     tint : bool
         Starved pixels in yellow.
-    two_sided, oriented, close_holes : bool
+    splat : Splat
+    two_sided, close_holes : bool
         See `Style`.
     edl_strength : float
     fly : bool
@@ -53,8 +54,8 @@ class Settings:
     frame_seconds: float = 0.05
     mode: Mode = "color"
     tint: bool = False
+    splat: Splat = Style().splat
     two_sided: bool = False
-    oriented: bool = True
     close_holes: bool = True
     edl_strength: float = Style().edl_strength
     fly: bool = False
@@ -66,7 +67,7 @@ class Settings:
         """Return the renderer's part."""
         return Style(
             two_sided=self.two_sided,
-            oriented=self.oriented,
+            splat=self.splat,
             close_holes=self.close_holes,
             edl_strength=self.edl_strength,
         )
