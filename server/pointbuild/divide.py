@@ -10,13 +10,12 @@ import numpy as np
 
 from .areas import Probing
 from .assemble import Nodes, assemble
-from .bucket import BucketTree, normal_table, partition
+from .bucket import BucketTree, partition
 from .pile import check_piles, partition_pile
 from .plan import Plan, make_plan
 from .rows import row_dtype
 from .scatter import Candidates, Regions, Scattered, gather, scatter
 from .spacing import model_spacing
-from .survey import NORMAL_BITS
 from .upper import Upper, candidate_limits, thresholds
 
 if TYPE_CHECKING:
@@ -165,9 +164,6 @@ def _partition(
     progress: Progress,
 ) -> list[BucketTree]:
     progress.stage("partition", int(rows.first[-1]))
-    has_normals = any(attribute.name == "normal" for attribute in schema)
-    table = normal_table(NORMAL_BITS) if has_normals else None
-
     one = partial(
         _partition_bucket,
         plan=plan,
@@ -177,7 +173,7 @@ def _partition(
         probing=probing,
         cloud_size=cloud_size,
         regions=rows,
-        normals=table,
+        normal_bits=next((attribute.bits for attribute in schema if attribute.kind == "normal"), 0),
     )
     journal = folder.journal("partition")
     trees: list[BucketTree] = []

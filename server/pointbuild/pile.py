@@ -53,7 +53,7 @@ def partition_pile(
     probing: Probing,
     cloud_size: int,
     regions: Rows,
-    normals: NDArray[np.int32] | None,
+    normal_bits: int,
 ) -> BucketTree:
     """Sort a pile's rows by node, on disk.
 
@@ -61,7 +61,7 @@ def partition_pile(
     ----------
     most : int
         Rows to hold in memory.
-    first_row, bucket, above, thresholds, cells, probing, cloud_size, regions, normals
+    first_row, bucket, above, thresholds, cells, probing, cloud_size, regions, normal_bits
         As for `bucket.partition`.
 
     Raises
@@ -78,7 +78,7 @@ def partition_pile(
     for count in counts.tolist():
         rows = np.empty(count, regions.dtype)
         regions.read(at, rows)
-        part = summarise(rows, np.zeros(1, np.int64), np.array([count]), normals)
+        part = summarise(rows, np.zeros(1, np.int64), np.array([count]), normal_bits)
         part.first[:] += at
         clouds.append(part.arrays())
         at += count

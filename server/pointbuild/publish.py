@@ -12,10 +12,9 @@ from lpc.errors import BuildError
 from lpc.header import Header
 from lpc.lattice import EPSILON, SLACK, position_error_bound, position_step
 
-from .costs import KINDS, cloud_costs, seal_with_costs
-from .encode import Geometry, Records, Run, encode_run, normal_vectors
+from .costs import cloud_costs, seal_with_costs
+from .encode import Geometry, Records, Run, encode_run
 from .spacing import node_spacings
-from .survey import NORMAL_BITS, Survey
 from .write import write_model
 
 if TYPE_CHECKING:
@@ -33,6 +32,7 @@ if TYPE_CHECKING:
     from .options import BuildOptions
     from .progress import Progress
     from .rows import Rows
+    from .survey import Survey
     from .work import Crew
 
 GENERATOR = "pointstream 0.1"
@@ -148,15 +148,11 @@ def _encode(
     effort: Effort,
     crew: Crew,
     progress: Progress,
-) -> dict[str, float]:
-    """Write all clouds in order and fill the records; what the kinds of numbers cost in some of the clouds."""
+) -> NDArray[np.float64]:
+    """Write all clouds in order and fill the records; what positions and attributes cost in some of them."""
     nodes, geometry = records.nodes, records.geometry
-    has_normals = any(attribute.kind == "normal" for attribute in found.schema)
-    table = normal_vectors(NORMAL_BITS) if has_normals else None
-    one = partial(
-        _encode_run, nodes=nodes, geometry=geometry, regions=regions, schema=found.schema, effort=effort, table=table
-    )
-    costs = np.zeros(len(KINDS))
+    one = partial(_encode_run, nodes=nodes, geometry=geometry, regions=regions, schema=found.schema, effort=effort)
+    costs = np.zeros(1 + len(found.schema))
     costed = set(np.linspace(0, len(nodes) - 1, COSTED_CLOUDS).astype(int).tolist())
     waiting = runs(nodes, RUN_SAMPLES)
     for sizes, checks, reach, spread, part in journal:
@@ -170,14 +166,13 @@ def _encode(
         clouds.writelines(run.frames)
         clouds.flush()
         records.add(run)
-        part = np.zeros(len(KINDS))
+        part = np.zeros(len(costs))
         for node in sorted(costed.intersection(range(first, stop))):
-            found_costs = cloud_costs(run.frames[node - first], int(nodes.samples[node]), found.schema)
-            part += [found_costs[kind] for kind in KINDS]
+            part += cloud_costs(run.frames[node - first], int(nodes.samples[node]), found.schema)
         costs += part
         journal.add(run.sizes, run.checks, run.reach, run.spread, part)
         progress.advance(int(nodes.samples[first:stop].sum()))
-    return dict(zip(KINDS, costs.tolist(), strict=True))
+    return costs
 
 
 def _encode_run(run: tuple[int, int], **shared: Any) -> Run:
