@@ -48,3 +48,17 @@ LARGEST_HOLE = 64
 
 WALLS = 7
 """Directions, of eight, in which a nearer surface must stand around a hole: fewer would round off corners."""
+
+KERNEL = 0.22
+"""Standard deviation of a blended sample's Gaussian in its plane, sides of its splat: half the spacing."""
+
+PIXEL = 0.3
+"""That of a pixel's filter in blended pictures, pixels: as wide as the box of the pixel, whose variance is 1/12."""
+
+KERNEL_ENDS = 2.6
+"""Where both end, standard deviations: at the rim of the disc, so that samples reach every pixel of it, and beyond the
+corners of a pixel, so that every sample reaches one."""
+
+BEHIND = 1.5
+"""How far behind the surface that is seen a blended sample still belongs to it, measured across the surface: radii of
+its kernel, or pixels where these are larger."""

@@ -13,9 +13,10 @@ import numpy as np
 
 from pointview import splats
 
-from . import kernels, picture_kernels, shading
+from . import kernels, picture_kernels, shading, tables
 from .arena import Arena
 from .backend import Frame, Style, Take
+from .blending import blend, linear_light
 from .pack import Packer
 from .seen import place_table
 
@@ -105,6 +106,15 @@ class CpuBackend:
             walls = source.ravel()[holes]
             for image in (rgb.reshape(-1, 3), depth.ravel(), node.ravel(), side.ravel(), starved.ravel()):
                 image[holes] = image[walls]
+        if style.splat == "blended":
+            linear = linear_light()
+
+            def see(samples: NDArray[Any], some: NDArray[Any]) -> int:
+                return kernels.seen(
+                    samples, self._vertex, self._color, some, places, halvings, rotation, view, light, albedo, linear
+                )
+
+            blend(rgb, depth, clouds, see, focal=camera.focal, threads=self._threads, in_parallel=self._in_parallel)
         if not self._packer.has_normals and style.edl_strength > 0:
             self._in_parallel(dim)
         return Frame(
@@ -161,7 +171,7 @@ class CpuBackend:
         return clouds, np.repeat(np.arange(len(slots), dtype=np.int32), blocks)
 
     def _view(self, cut: Cut, camera: Camera, style: Style) -> Any:
-        view = np.zeros(1, dtype=kernels.VIEW)[0]
+        view = np.zeros(1, dtype=tables.VIEW)[0]
         view["width"], view["height"], view["focal"] = camera.width, camera.height, camera.focal
         view["near"] = cut.depth_range[0]
         view["largest"], view["round"] = splats.LARGEST, splats.ROUND
@@ -169,11 +179,11 @@ class CpuBackend:
         view["bulge"], view["steepest"] = splats.BULGE, splats.STEEPEST
         view["closing"], view["reach"] = splats.CLOSING * camera.focal, splats.REACH
         view["cull"] = self._packer.has_normals and not style.two_sided
-        view["oriented"] = style.splat == "disc"
+        view["oriented"] = style.splat in ("disc", "blended")
         return view
 
     def _light(self, camera: Camera, style: Style) -> Any:
-        light = np.zeros(1, dtype=kernels.LIGHT)[0]
+        light = np.zeros(1, dtype=tables.LIGHT)[0]
         for name in ("ambient", "diffuse", "specular", "shininess", "unlit"):
             light[name] = getattr(shading, name.upper())
         light["lamp_x"], light["lamp_y"], light["lamp_z"] = shading.lamp() @ camera.rotation()

@@ -191,7 +191,7 @@ class GlBackend:
             "steepest": splats.STEEPEST,
             "reach": splats.REACH,
             "closing": splats.CLOSING * camera.focal,
-            "oriented": style.splat == "disc",
+            "oriented": style.splat in ("disc", "blended"),
             "albedo": tuple(channel / 255 for channel in surface),
             "lamp": tuple(shading.lamp().tolist()),
             "lit": self._packer.has_normals,

@@ -60,41 +60,6 @@ PLACE = np.dtype(
 HALVING = np.dtype([("axis", np.int32), ("half", np.float32)])
 """How the cells of a level are halved (see `places`)."""
 
-VIEW = np.dtype(
-    [
-        ("width", np.float32),
-        ("height", np.float32),
-        ("focal", np.float32),
-        ("near", np.float32),
-        ("largest", np.float32),  # side of a splat, pixels; see `splats` for this and the next six
-        ("round_from", np.float32),
-        ("round", np.float32),
-        ("bulge", np.float32),
-        ("steepest", np.float32),
-        ("closing", np.float32),  # side of a splat over the spacing to close, times the focal length
-        ("reach", np.float32),
-        ("cull", np.bool_),  # drop samples whose normal points away
-        ("oriented", np.bool_),  # samples with normals are discs in their tangent plane
-    ]
-)
-"""What all splats of a frame share."""
-
-LIGHT = np.dtype(
-    [
-        ("ambient", np.float32),  # see `shading`
-        ("diffuse", np.float32),
-        ("specular", np.float32),
-        ("shininess", np.float32),
-        ("unlit", np.float32),
-        ("lamp_x", np.float32),  # unit vector, axes of model space
-        ("lamp_y", np.float32),
-        ("lamp_z", np.float32),
-        ("lit", np.bool_),
-        ("two_sided", np.bool_),
-    ]
-)
-"""How samples are lit."""
-
 F = np.float32
 
 
@@ -431,6 +396,62 @@ def resolve(
             for channel in range(3):
                 value = F(color[i, channel]) * albedo[channel] * bright + F(255.0) * shine
                 rgb[row, column, channel] = np.uint8(min(value + F(0.5), F(255.0)))
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def seen(
+    samples: NDArray[Any],
+    vertex: NDArray[np.uint16],
+    color: NDArray[np.uint8],
+    clouds: NDArray[Any],
+    places: NDArray[Any],
+    halvings: NDArray[Any],
+    rotation: NDArray[np.float32],
+    view: Any,
+    light: Any,
+    albedo: NDArray[np.float32],
+    linear: NDArray[np.float32],
+) -> int:  # pragma: no cover - compiled
+    """Write the samples before the eye that face it to `samples`, a SAMPLE each, and return how many they are."""
+    count = 0
+    for c in range(len(clouds)):
+        cloud = clouds[c]
+        spacing = cloud.spacing
+        for i in range(cloud.first, cloud.first + cloud.count):
+            x = cloud.x + cloud.scale * F(vertex[i, 0])
+            y = cloud.y + cloud.scale * F(vertex[i, 1])
+            z = cloud.z + cloud.scale * F(vertex[i, 2])
+            depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
+            if not depth > view.near:
+                continue
+            code = int(vertex[i, 3])
+            if view.cull and code != 0:
+                nx, ny, nz = _octahedral(code)
+                if nx * x + ny * y + nz * z > F(0.0):
+                    continue
+            if cloud.level >= 0:
+                inside_x = cloud.corner_x + cloud.scale * F(vertex[i, 0])
+                inside_y = cloud.corner_y + cloud.scale * F(vertex[i, 1])
+                inside_z = cloud.corner_z + cloud.scale * F(vertex[i, 2])
+                spacing, _ = _spacing_at(cloud, inside_x, inside_y, inside_z, view.reach, places, halvings)
+            right = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
+            up = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
+            plane = (F(0.0), F(0.0), F(-1.0))
+            if view.oriented and code != 0:
+                plane = _plane(code, right, up, depth, rotation, view.steepest)
+            bright, shine = F(1.0), F(0.0)
+            if light.lit:
+                bright, shine = _lit(code, x, y, z, light)
+            sample = samples[count]
+            sample.right, sample.up, sample.depth = right, up, depth
+            sample.nx, sample.ny, sample.nz = plane
+            sample.side = min(spacing * view.closing / depth, view.largest)
+            shown = F(255.0) * shine + F(0.5)
+            sample.red = linear[int(min(F(color[i, 0]) * albedo[0] * bright + shown, F(255.0)))]
+            sample.green = linear[int(min(F(color[i, 1]) * albedo[1] * bright + shown, F(255.0)))]
+            sample.blue = linear[int(min(F(color[i, 2]) * albedo[2] * bright + shown, F(255.0)))]
+            count += 1
+    return count
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
