@@ -71,6 +71,8 @@ class Feed:
         Put this link before the model.
     capacity : int
         Bytes of decoded clouds.
+    wake : callable
+        Told of every piece of news, on the feed's thread: a frame loop may sleep until then.
 
     Attributes
     ----------
@@ -87,10 +89,11 @@ class Feed:
         cache: Cache | None = None,
         link: Profile | None = None,
         capacity: int = LayerOptions().capacity,
+        wake: Callable[[], None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.target, self._cache, self._link = target, cache, link
-        self._options, self._clock = LayerOptions(capacity=capacity), clock
+        self._options, self._wake, self._clock = LayerOptions(capacity=capacity), wake, clock
         self._news: deque[News] = deque()
         self._ask: Ask | None = None
         self._stats: LayerStats | None = None
@@ -146,6 +149,7 @@ class Feed:
             except (LpcError, OSError) as error:
                 self._news.append(Failed(" ".join(str(error).split())))
                 self._wanting = False
+                self._wake()
 
     async def _until_closed(self) -> None:
         """Feed until `close`, which may come while a host does not answer."""
@@ -169,6 +173,7 @@ class Feed:
                 if stats.build != build:
                     build, posted = stats.build, np.zeros(layer.header.nodes, dtype=bool)
                     self._news.append(Opened(layer.index, build))
+                    self._wake()
                 ask = self._ask
                 if ask is not None and ask.build == build:
                     layer.end_frame(ask.wants, pinned=ask.pinned)
@@ -198,4 +203,5 @@ class Feed:
             self._news.append(Gone(tuple(gone.tolist())))
         for node in changed[resident[changed]].tolist():
             self._news.append(Came(node, layer.take(node)))
+        self._wake()
         return resident

@@ -7,13 +7,15 @@ always the current one. A frame waits for its picture there, never for data: all
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from pointview.colouring import Colouring, Mode, available_modes
 from pointview.render import Kind, open_backend
 from pointview.render.picture import tint_starved
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import numpy as np
     from numpy.typing import NDArray
 
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
 
     from .mirror import Mirror
     from .settings import Settings
+
+Result = TypeVar("Result")
 
 
 class Painter:
@@ -49,6 +53,10 @@ class Painter:
     def draw(self, cut: Cut, mirror: Mirror, camera: Camera, settings: Settings) -> Frame:
         """Draw a cut of what the mirror holds."""
         return self._thread.submit(self._draw, cut, mirror, camera, settings).result()
+
+    def run(self, work: Callable[[], Result]) -> Result:
+        """Do other work on the painter's thread, and wait for it: kernels are loaded from disk at their first use."""
+        return self._thread.submit(work).result()
 
     def close(self) -> None:
         """Give back the renderer's memory and contexts."""

@@ -60,7 +60,7 @@ class Panel:
         imgui.push_item_width(-6.5 * letter)
         self._views(settings)
         if imgui.collapsing_header("Quality", imgui.TreeNodeFlags_.default_open):
-            _quality(settings)
+            _quality(viewer)
         if imgui.collapsing_header("Colours", imgui.TreeNodeFlags_.default_open):
             _colours(viewer)
         if imgui.collapsing_header("Statistics", imgui.TreeNodeFlags_.default_open):
@@ -115,7 +115,8 @@ class Panel:
             imgui.text_disabled(renderer)
 
 
-def _quality(settings: Settings) -> None:
+def _quality(viewer: Viewer) -> None:
+    settings = viewer.settings
     logarithmic = imgui.SliderFlags_.logarithmic
     _, settings.tolerance = imgui.slider_float("tolerance", settings.tolerance, *TOLERANCES, "%.2f px", logarithmic)
     _, settings.limited = imgui.checkbox("##limited", settings.limited)
@@ -139,6 +140,9 @@ def _quality(settings: Settings) -> None:
         settings.splat = SPLATS[at]
     _, settings.close_holes = imgui.checkbox("close holes", settings.close_holes)
     _, settings.two_sided = imgui.checkbox("both sides", settings.two_sided)
+    _, settings.occlusion = imgui.checkbox("leave out what is hidden", settings.occlusion)
+    if viewer.culling.verdict is not None:
+        imgui.text_wrapped(viewer.culling.verdict)
 
 
 def _colours(viewer: Viewer) -> None:

@@ -36,6 +36,8 @@ class Settings:
     tint : bool
         Starved pixels in yellow.
     splat : Splat
+    occlusion : bool
+        Leave out what is hidden, where that pays.
     two_sided, close_holes : bool
         See `Style`.
     edl_strength : float
@@ -54,6 +56,7 @@ class Settings:
     frame_seconds: float = 0.05
     mode: Mode = "color"
     tint: bool = False
+    occlusion: bool = True
     splat: Splat = Style().splat
     two_sided: bool = False
     close_holes: bool = True

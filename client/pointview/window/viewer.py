@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from pointview.colouring import MODES, available_modes
 from pointview.render.picture import save_picture
 
 from .controls import Viewpoint, vertical_of
+from .culling import Culling
 from .inputs import Inputs, Scene, moved
 from .mirror import Mirror
 from .painter import Painter, shown
@@ -85,6 +87,7 @@ class Viewer:
         self.feed: Feed | None = None
         self.mirror = Mirror()
         self.quality = Quality.at(settings.tolerance)
+        self.culling = Culling(clock)
         self.view: Viewpoint | None = None
         self.cut: Cut | None = None
         self.frame: Frame | None = None
@@ -112,8 +115,9 @@ class Viewer:
 
     @property
     def busy(self) -> bool:
-        """Whether the next frame has something to draw for sure."""
-        return self._redraw or self._clock() - self._moved_at < REST
+        """Whether the next frame has something to do for sure."""
+        at_rest = self.culling.settled and not self.culling.changed
+        return self._redraw or not at_rest or self._clock() - self._moved_at < REST
 
     def advance(self, did: Inputs) -> NDArray[np.uint8] | None:
         """Take in a frame's input and what came; return the new picture, or None if it is the same."""
@@ -133,21 +137,26 @@ class Viewer:
         moving = now - self._moved_at < REST
         state = (self.view.camera, moving, *_look(self.settings))
         picture = None
-        if news or self._redraw or state != self._drawn:
+        if news or self._redraw or self.culling.changed or state != self._drawn:
             picture = self._draw(moving=moving)
             self._drawn = state
+        elif self.cut is not None and self.frame is not None and not self.culling.settled:
+            self.painter.run(partial(self.culling.look, self.cut, self.view.camera, self.frame))
         if now - self._share_at > SHARE_EVERY:
-            self.loaded, self._share_at = loaded_bytes(self.mirror, self.view.camera, self.settings), now
+            self._share_at = now
+            self.loaded = loaded_bytes(self.mirror, self.view.camera, self.settings, self.culling.hidden)
         return picture
 
     def _draw(self, *, moving: bool) -> NDArray[np.uint8]:
         assert self.view is not None
-        assert self.feed is not None
         camera, first = self.view.camera, self.frame is None
         start = self._clock()
-        self.cut = self.quality.cut(self.mirror, camera, self.settings, moving=moving)
-        self.feed.ask(self.mirror.build, self.cut.asks, self.cut.nodes)
-        self.frame = self.painter.draw(self.cut, self.mirror, camera, self.settings)
+        self._show(camera, moving=moving)
+        assert self.cut is not None
+        assert self.frame is not None
+        drew = partial(self.culling.drew, self.cut, camera, self.frame, seconds=self._clock() - start)
+        if self.painter.run(drew):
+            self._show(camera, moving=moving)  # with what shows up (LPC 4: the third pass)
         seconds = self._clock() - start
         # What compiles or uploads says nothing about the next frame.
         settled = not first and self.frame.uploads * 4 <= self.frame.clouds
@@ -155,6 +164,15 @@ class Viewer:
         assert self.scene is not None
         self.scene = _seen(self.scene, self.frame, camera)
         return shown(self.frame, self.settings)
+
+    def _show(self, camera: Camera, *, moving: bool) -> None:
+        """Refine, ask and draw."""
+        assert self.feed is not None
+        assert self.mirror.index is not None
+        self.culling.prepare(self.mirror.index, wanted=self.settings.occlusion)
+        self.cut = self.quality.cut(self.mirror, camera, self.settings, self.culling.hidden, moving=moving)
+        self.feed.ask(self.mirror.build, self.cut.asks, self.cut.nodes)
+        self.frame = self.painter.draw(self.cut, self.mirror, camera, self.settings)
 
     def _place(self, did: Inputs, now: float) -> None:
         """Move the camera; place it first where the model is new."""
@@ -255,7 +273,7 @@ def _look(settings: Settings) -> tuple[object, ...]:
     """Return the settings that change the picture."""
     return (
         settings.tolerance, settings.limited and settings.budget, settings.steady and settings.frame_seconds,
-        settings.mode, settings.tint, settings.style(),
+        settings.mode, settings.tint, settings.occlusion, settings.style(),
     )  # fmt: skip
 
 
