@@ -25,7 +25,12 @@ MODE_NAMES: dict[Mode, str] = {
     "classification": "classification", "normal": "normal", "level": "level",
 }  # fmt: skip
 
-SPLAT_NAMES: dict[Splat, str] = {"square": "squares", "round": "round", "disc": "discs in the surface"}
+SPLAT_NAMES: dict[Splat, str] = {
+    "square": "squares",
+    "round": "round",
+    "disc": "discs in the surface",
+    "blended": "blended",
+}
 SPLATS = tuple(SPLAT_NAMES)
 
 
