@@ -7,9 +7,9 @@ closed in the picture (`HOLE`). What remains is 0.02% of a closed surface, and s
 spacing.
 
 A splat is a square of pixels where it covers only a few. A larger one is a disc: in the tangent plane of its sample
-where there is a normal, which keeps silhouettes thin and depths right; else facing the eye. Discs overlap by far, and a
-*bulge* decides between them: the depth grows with the square of the distance from the centre, so the nearest sample
-is seen, each in a cell of its own.
+where there is a normal or its neighbours make one (`render.planes`), which keeps silhouettes thin and depths right;
+else facing the eye. Discs overlap by far, and a *bulge* decides between them: the depth grows with the square of the
+distance from the centre, so the nearest sample is seen, each in a cell of its own.
 """
 
 from __future__ import annotations
