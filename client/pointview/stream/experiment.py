@@ -192,6 +192,7 @@ def _report(
     assert recording.header is not None
     stats, rate = recording.stats, experiment.profile.down_rate
     could_carry = None if rate is None else rate / 8.0 * stats.wanted_seconds
+    carried = max(0, stats.payload_bytes - stats.idle_bytes)  # what came while nothing was wanted is not to its credit
     return Report(
         model=experiment.model,
         link=experiment.link,
@@ -207,7 +208,7 @@ def _report(
         samples=recording.samples,
         bytes=stats.bytes_received,
         requests=stats.requests,
-        link_utilisation=None if not could_carry else min(1.0, max(0, stats.payload_bytes - stats.idle_bytes) / could_carry),
+        link_utilisation=None if not could_carry else min(1.0, carried / could_carry),
         first_picture_s=recording.first_picture_s,
         settled_s=recording.settled_s,
         tolerance=experiment.tolerance,
