@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -27,10 +28,17 @@ STILL = 6.0
 
 @dataclass(slots=True)
 class Quality:
-    """The tolerance from frame to frame: one while the camera moves, one for when it rests."""
+    """The tolerance from frame to frame: one while the camera moves, one for when it rests.
+
+    Attributes
+    ----------
+    tolerance : float
+        Of the last cut, pixels.
+    """
 
     moving: Feedback
     resting: Feedback
+    tolerance: float = math.inf
 
     @classmethod
     def at(cls, tolerance: float) -> Quality:
@@ -44,10 +52,12 @@ class Quality:
         options: dict[str, Any] = {"cull_backfaces": not settings.two_sided, "hidden": hidden}
         if settings.steady:
             tolerance = max(tolerance, (self.moving if moving else self.resting).tolerance)
+        self.tolerance = tolerance
         if not settings.limited:
             return refine(mirror.index, camera, tolerance, mirror.resident, **options)
         index = mirror.index
         within = allowance(index, camera, settings.budget, index.known, at_least=tolerance, **options)
+        self.tolerance = within.tolerance
         return refine_within(index, camera, within, mirror.resident, **options)
 
     def took(self, seconds: float, settings: Settings, *, moving: bool) -> bool:

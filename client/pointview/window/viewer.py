@@ -17,6 +17,7 @@ from pointview.render.picture import save_picture
 
 from .controls import Viewpoint, vertical_of
 from .culling import Culling
+from .feed import View
 from .inputs import Inputs, Scene, moved
 from .mirror import Mirror
 from .painter import Painter, shown
@@ -171,7 +172,13 @@ class Viewer:
         assert self.mirror.index is not None
         self.culling.prepare(self.mirror.index, wanted=self.settings.occlusion)
         self.cut = self.quality.cut(self.mirror, camera, self.settings, self.culling.hidden, moving=moving)
-        self.feed.ask(self.mirror.build, self.cut.asks, self.cut.nodes)
+        view = View(
+            camera=camera,
+            tolerance=self.quality.tolerance,
+            cull_backfaces=not self.settings.two_sided,
+            hidden=self.culling.hidden,
+        )
+        self.feed.ask(self.mirror.build, self.cut.asks, self.cut.nodes, view)
         self.frame = self.painter.draw(self.cut, self.mirror, camera, self.settings)
 
     def _place(self, did: Inputs, now: float) -> None:

@@ -55,7 +55,7 @@ class Feed:
             taken.append(Came(node, self.model.clouds[node]))
         return taken
 
-    def ask(self, build, wants, pinned):
+    def ask(self, build, wants, pinned, view):
         self.wants = wants.tolist()
 
     def close(self):
