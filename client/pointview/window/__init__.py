@@ -11,10 +11,13 @@
     culling    when the picture is asked what it hides
     quality    tolerance and cut of the next frame
     screen     the glfw window, the picture on it, Dear ImGui's frame
-    panel      what is written on it
+    scales     tidy numbers: ticks of a legend, length of a scale bar, units
+    overlay    what is written on the picture: legend, axes, scale bar, load bar, messages
+    panel      settings and statistics beside it
     viewer     one session: the parts put together
     loop       frame after frame, and what they took
     cli        options
 
-glfw, Dear ImGui and OpenGL are imported in `screen`, `keyboard`, `panel` and `overlay` alone: the extra ``window`` brings them.
+glfw, Dear ImGui and OpenGL are imported in `screen`, `keyboard`, `panel` and `overlay` alone: the extra ``window``
+brings them.
 """

@@ -1,7 +1,7 @@
 """Keys of the window, from glfw itself: a press counts with its modifiers, however long the frame takes that sees it.
 
-Dear ImGui tells what is down at the time of a frame; where a frame takes long, Ctrl Q has come and gone by then, or only
-Q is left. Letters are those of the person's keyboard layout, not of the place of the key.
+Dear ImGui tells what is down at the time of a frame; where a frame takes long, Ctrl Q has come and gone by then, or
+only Q is left. Letters are those of the person's keyboard layout, not of the place of the key.
 """
 
 from __future__ import annotations

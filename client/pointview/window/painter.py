@@ -9,7 +9,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, TypeVar
 
-from pointview.colouring import Colouring, Mode, available_modes
+from pointview.colouring import Colouring, available_modes
 from pointview.render import Kind, open_backend
 from pointview.render.picture import tint_starved
 
@@ -64,18 +64,19 @@ class Painter:
         self._thread.shutdown()
 
     def _draw(self, cut: Cut, mirror: Mirror, camera: Camera, settings: Settings) -> Frame:
-        backend, colouring = self._prepared(mirror, settings.mode)
+        backend, colouring = self._prepared(mirror, settings)
         return backend.draw(cut, lambda node: colouring.cloud(node, mirror.take(node)), camera, settings.style())
 
-    def _prepared(self, mirror: Mirror, asked: Mode) -> tuple[Backend, Colouring]:
+    def _prepared(self, mirror: Mirror, settings: Settings) -> tuple[Backend, Colouring]:
         """Return renderer and colours; made anew when model, build or mode changed."""
         modes = available_modes(mirror.header)
-        mode = asked if asked in modes else modes[0]
-        key = (id(mirror.index), mirror.build, mode, 0 in mirror.clouds)
+        mode = settings.mode if settings.mode in modes else modes[0]
+        up = None if settings.up is None else "xyz".index(settings.up)
+        key = (id(mirror.index), mirror.build, mode, 0 in mirror.clouds, up)
         if self._backend is None or self.colouring is None or key != self._key:
             self._forget()
             assert mirror.index is not None
-            self.colouring = Colouring(mode, mirror.header, mirror.index, mirror.clouds.get(0))
+            self.colouring = Colouring(mode, mirror.header, mirror.index, mirror.clouds.get(0), up=up)
             self._backend = open_backend(self._kind, self.colouring.header, threads=self._threads)
             self._key = key
         return self._backend, self.colouring

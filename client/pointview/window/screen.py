@@ -90,6 +90,7 @@ class Screen:
         io.fonts.add_font_default_vector()
         style.font_size_base = LETTERS
         style.frame_rounding = style.grab_rounding = 3.0
+        style.set_color_(imgui.Col_.slider_grab, (0.26, 0.59, 0.98, 0.5))  # the number behind it stays legible
         self._scale = 1.0
         self._imgui = GlfwRenderer(self._window, attach_callbacks=True)
         self._keyboard = Keyboard(self._window, self._imgui)
@@ -98,6 +99,7 @@ class Screen:
         glfw.set_drop_callback(self._window, drop)
         self._shown_at = glfw.get_time()
         self._lively = LIVELY
+        self._title = title
         self._corner, self._size = (0, 0), size
 
     @property
@@ -110,9 +112,16 @@ class Screen:
         """What OpenGL calls the graphics hardware of the window."""
         return str(self._context.info["GL_RENDERER"])
 
+    @property
+    def letters(self) -> float:
+        """Width of the window in heights of the panel's letters."""
+        return float(glfw.get_window_size(self._window)[0] / (LETTERS * self._scale))
+
     def rename(self, title: str) -> None:
-        """Give the window another title."""
-        glfw.set_window_title(self._window, title)
+        """Give the window a title."""
+        if title != self._title:
+            glfw.set_window_title(self._window, title)
+            self._title = title
 
     def wait(self, *, busy: bool) -> None:
         """Collect input; without anything to do, wait for it or for `wake`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from pointview.render import Splat, Style
 
@@ -45,8 +45,10 @@ class Settings:
         Dragging turns the head instead of the model.
     speed : float
         Of flying, sizes of the model a second.
-    panel, help : bool
-        What is shown.
+    up : {"y", "z"}, optional
+        The model's vertical; by its header if not given.
+    panel, help, marks : bool
+        What is shown; the marks are axes and scale bar.
     """
 
     tolerance: float = 1.0
@@ -63,7 +65,9 @@ class Settings:
     edl_strength: float = Style().edl_strength
     fly: bool = False
     speed: float = 0.25
+    up: Literal["y", "z"] | None = None
     panel: bool = True
+    marks: bool = True
     help: bool = False
 
     def style(self) -> Style:

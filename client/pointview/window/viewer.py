@@ -41,6 +41,9 @@ REST = 0.25
 SHARE_EVERY = 0.5
 """Seconds between two looks at how much of the view is here."""
 
+NOTICE = 8.0
+"""Seconds that a notice is shown."""
+
 SCANS = (".ply", ".las", ".laz", ".e57", ".pcd", ".xyz", ".csv", ".txt", ".pts", ".ptx", ".obj")
 
 
@@ -96,23 +99,42 @@ class Viewer:
         self.recorder: Recorder | None = None
         self.message = ""
         self.loaded = (0, 0)
+        self.drawing = 0.0
         self.longest_handover = 0.0
         self.closing = False
         self._drawn: tuple[object, ...] = ()
-        self._moved_at = self._share_at = -1e9
+        self._moved_at = self._share_at = self._turned_at = self._told_at = -1e9
         self._redraw = False
 
     def open(self, target: str) -> None:
         """Show another model in place of the present one."""
         self._close_feed()
         self.mirror, self.view, self.cut, self.frame, self.scene = Mirror(), None, None, None, None
-        self.message = ""
+        self.message, self.loaded = "", (0, 0)
+        self.settings.up = None
         self.feed = self._open_feed(target)
 
     def close(self) -> None:
         """Stop what was started."""
         self._close_feed()
         self.painter.close()
+
+    @property
+    def title(self) -> str:
+        """Of the window."""
+        return "pointstream" if self.feed is None else f"{self.feed.target} - pointstream"
+
+    @property
+    def up(self) -> str:
+        """Name of the vertical axis."""
+        if self.settings.up is not None:
+            return self.settings.up
+        return "y" if self.mirror.index is None or self.mirror.header.crs is None else "z"
+
+    @property
+    def turning(self) -> bool:
+        """Whether the camera turned around its pivot just now, or got another."""
+        return self._clock() - self._turned_at < 2 * REST
 
     @property
     def busy(self) -> bool:
@@ -123,6 +145,8 @@ class Viewer:
     def advance(self, did: Inputs) -> NDArray[np.uint8] | None:
         """Take in a frame's input and what came; return the new picture, or None if it is the same."""
         now = self._clock()
+        if now - self._told_at > NOTICE and not self.mirror.failure:
+            self.message = ""
         self._obey(did)
         if self.feed is None:
             return None
@@ -158,7 +182,7 @@ class Viewer:
         drew = partial(self.culling.drew, self.cut, camera, self.frame, seconds=self._clock() - start)
         if self.painter.run(drew):
             self._show(camera, moving=moving)  # with what shows up (LPC 4: the third pass)
-        seconds = self._clock() - start
+        seconds = self.drawing = self._clock() - start
         # What compiles or uploads says nothing about the next frame.
         settled = not first and self.frame.uploads * 4 <= self.frame.clouds
         self._redraw = settled and self.quality.took(seconds, self.settings, moving=moving)
@@ -184,12 +208,13 @@ class Viewer:
     def _place(self, did: Inputs, now: float) -> None:
         """Move the camera; place it first where the model is new."""
         width, height = did.size
-        if self.view is None or self.scene is None:
+        vertical = vertical_of(z_up=self.up == "z")
+        if self.view is None or self.scene is None or self.scene.vertical != vertical:
             home = self._home(width, height)
             self.view = Viewpoint.of(home)
             self.scene = Scene(
                 bounds=self.mirror.header.bounds,
-                vertical=vertical_of(georeferenced=self.mirror.header.crs is not None),
+                vertical=vertical,
                 home=home,
                 depth=np.full((height, width), np.inf, dtype=np.float32),
                 shot=home,
@@ -197,19 +222,22 @@ class Viewer:
         after = moved(self.view, did, self.scene, fly=self.settings.fly, speed=self.settings.speed)
         if after.camera != self.view.camera:
             self._moved_at = now
+        if did.picked or (did.turned != (0.0, 0.0) and not self.settings.fly):
+            self._turned_at = now
         self.view = after
 
     def _home(self, width: int, height: int) -> Camera:
-        if self.options.view is not None:
+        if self.options.view is not None and self.settings.up is None:
             return Camera.from_view(self.options.view, width=width, height=height)
-        return Camera.frame_model(self.mirror.header, width=width, height=height)
+        return Camera.frame_model(self.mirror.header, width=width, height=height, z_up=self.up == "z")
 
     def _obey(self, did: Inputs) -> None:
         """Do what keys and drops command besides moving the camera."""
         settings = self.settings
         for target in did.dropped[:1]:
             if target.lower().endswith(SCANS):
-                self.message = f"{Path(target).name} is a scan: `pointstream build` makes a model of it"
+                name = Path(target).name
+                self._tell(f"{name} is a scan: make a model of it with `pointstream build {name} -o MODEL.lpc`")
             else:
                 self.open(target)
         for key in did.pressed:
@@ -236,6 +264,8 @@ class Viewer:
                 self.save_picture()
             elif key == "r":
                 self.toggle_recording()
+            elif key == "u":
+                settings.up = "z" if self.up == "y" else "y"
             elif key == "quit":
                 self.closing = True
 
@@ -265,9 +295,13 @@ class Viewer:
         try:
             write()
         except LpcError as error:
-            self.message = str(error)
+            self._tell(str(error))
         else:
-            self.message = f"written: {path}"
+            self._tell(f"written: {path}")
+
+    def _tell(self, text: str) -> None:
+        """Show a notice for a while."""
+        self.message, self._told_at = text, self._clock()
 
     def _close_feed(self) -> None:
         if self.feed is not None:
@@ -280,7 +314,7 @@ def _look(settings: Settings) -> tuple[object, ...]:
     """Return the settings that change the picture."""
     return (
         settings.tolerance, settings.limited and settings.budget, settings.steady and settings.frame_seconds,
-        settings.mode, settings.tint, settings.occlusion, settings.style(),
+        settings.mode, settings.tint, settings.occlusion, settings.up, settings.style(),
     )  # fmt: skip
 
 
