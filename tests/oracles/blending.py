@@ -62,7 +62,7 @@ def weights(center: Array, normal: Array, side: float, depth: Array, focal: floa
         inside = (here[..., None] * ray - center) @ along.T  # plane coordinates of where the ray meets the plane
         offset = inside @ jacobian.T  # the same in pixels around the sample
         q = np.einsum("hwi,ij,hwj->hw", offset, np.linalg.inv(covariance), offset)
-        lean = abs(normal @ center) / center[2]
+        lean = max(abs(normal @ center) / center[2], splats.SLANTED)
         slack = splats.BEHIND * max(splats.KERNEL_ENDS * deviation, center[2] / focal) / lean
         counts = (q <= splats.KERNEL_ENDS**2) & (here > 0) & (here <= depth + slack) & np.isfinite(depth)
         share = deviation**2 * abs(np.linalg.det(jacobian)) / np.sqrt(np.linalg.det(covariance))

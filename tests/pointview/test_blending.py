@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from oracles import blending as oracle
 from oracles import surfaces
@@ -174,8 +174,9 @@ anywhere = st.tuples(
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.lists(anywhere, min_size=1, max_size=6), numbers(2.0**-20, 2000.0), st.booleans())
-def test_no_sample_makes_a_colour_that_is_none(found, front, empty):
+@example([(0.0, 100.0, 2.0**-20, (0.0, 1.0, 0.0), 37.0, (0.0, 0.0, 0.0))], 3.0)
+@given(st.lists(anywhere, min_size=1, max_size=6), numbers(2.0**-20, 2000.0))
+def test_no_sample_makes_a_colour_that_is_none(found, front):
     samples = np.zeros(len(found), dtype=tables.SAMPLE)
     for sample, (right, up, depth, normal, side, color) in zip(samples, found, strict=True):
         sample["right"], sample["up"], sample["depth"], sample["side"] = right, up, depth, side

@@ -21,6 +21,7 @@ KERNEL = np.dtype(
         ("pixel", np.float32),  # that of the pixel's filter, pixels
         ("ends", np.float32),  # both end at this many deviations
         ("behind", np.float32),  # how far behind what is seen a sample still counts, radii of its kernel or pixels
+        ("slanted", np.float32),  # least cosine to the ray that this allows for
     ]
 )
 """What all kernels of a frame share."""
@@ -67,9 +68,9 @@ def gather(
         spread = kernel.width * sample.side
         spread2 = spread * spread
         lean_x, lean_y = nx - slope_x * nz, ny - slope_y * nz
-        # J J' and its determinant; y counts downward in the picture.
-        xx = F(1.0) + slope_x * slope_x - lean_x * lean_x
-        yy = F(1.0) + slope_y * slope_y - lean_y * lean_y
+        # J J' and its determinant; y counts downward in the picture. Far off the axis rounding may turn signs.
+        xx = max(F(1.0) + slope_x * slope_x - lean_x * lean_x, F(0.0))
+        yy = max(F(1.0) + slope_y * slope_y - lean_y * lean_y, F(0.0))
         xy = lean_x * lean_y - slope_x * slope_y
         along = nx * slope_x + ny * slope_y + nz
         # det V as a sum of what is positive: the textbook's difference loses thin ellipses to rounding.
@@ -77,7 +78,7 @@ def gather(
         xx, yy, xy = spread2 * xx + pixel2, spread2 * yy + pixel2, spread2 * xy
         radius = kernel.ends * spread * inverse
         stretch = kernel.ends / (F(1.0) - min(radius, F(0.5)))
-        half_x, half_y = stretch * math.sqrt(max(xx, F(0.0))), stretch * math.sqrt(max(yy, F(0.0)))
+        half_x, half_y = stretch * math.sqrt(xx), stretch * math.sqrt(yy)
         first = max(math.ceil(py - half_y - F(0.5)), top)
         last = min(math.ceil(py + half_y - F(0.5)), bottom)
         left = max(math.ceil(px - half_x - F(0.5)), 0)
@@ -86,15 +87,15 @@ def gather(
             continue
         share = spread2 * abs(along) / math.sqrt(det)
         inverse_det = F(1.0) / det
-        # Across the surface, not along the ray: seen from the side, a surface falls away fast.
-        farthest = here * kernel.behind * max(radius, inverse) / abs(along)
+        # Across the surface, not along the ray: seen from the side, it falls away fast.
+        farthest = here * kernel.behind * max(radius, inverse) / max(abs(along), kernel.slanted)
         for row in range(first, last):
             dy = F(row) + F(0.5) - py
             part = ny * (middle_y - F(row) - F(0.5)) * inverse + nz
             for column in range(left, end):
                 dx = F(column) + F(0.5) - px
                 ratio = along / (nx * (F(column) + F(0.5) - middle_x) * inverse + part)
-                q = ratio * ratio * (yy * dx * dx - F(2.0) * xy * dx * dy + xx * dy * dy) * inverse_det
+                q = abs(ratio * ratio * (yy * dx * dx - F(2.0) * xy * dx * dy + xx * dy * dy) * inverse_det)
                 seen = depth[row, column]
                 if q <= most and ratio > F(0.0) and ratio * here <= seen + farthest and seen != np.inf:
                     weight = share * math.exp(F(-0.5) * q)

@@ -44,7 +44,7 @@ def kernel(*, focal: float) -> Any:
     """Return what all kernels of a picture share, a `blend_kernels.KERNEL`."""
     shared = np.zeros(1, dtype=blend_kernels.KERNEL)[0]
     shared["focal"], shared["width"], shared["pixel"] = focal, splats.KERNEL, splats.PIXEL
-    shared["ends"], shared["behind"] = splats.KERNEL_ENDS, splats.BEHIND
+    shared["ends"], shared["behind"], shared["slanted"] = splats.KERNEL_ENDS, splats.BEHIND, splats.SLANTED
     return shared
 
 

@@ -21,7 +21,7 @@ void main() {
     vec2 d = gl_FragCoord.xy - middle;
     vec3 ray = vec3((gl_FragCoord.xy - 0.5 * size) / focal, 1.0);
     float ratio = dot(plane, center) / (center.z * dot(plane, ray));
-    float q = ratio * ratio * (form.x * d.x * d.x + form.y * d.y * d.y + 2.0 * form.z * d.x * d.y);
+    float q = abs(ratio * ratio * (form.x * d.x * d.x + form.y * d.y * d.y + 2.0 * form.z * d.x * d.y));
     if (!(q <= MOST && ratio > 0.0 && ratio * center.z <= depth + farthest && depth < @EMPTY@))
         discard;
     sums = share * exp(-0.5 * q) * vec4(linear, 1.0);

@@ -150,17 +150,17 @@ void shape_kernel(float side) {
     vec2 slope = center.xy / center.z;
     float spread = @KERNEL@ * side;
     vec2 lean = plane.xy - slope * plane.z;
-    vec2 own = 1.0 + slope * slope - lean * lean;
+    vec2 own = max(1.0 + slope * slope - lean * lean, 0.0);
     float along = dot(plane, vec3(slope, 1.0));
     float spread2 = spread * spread;
     float det = spread2 * along * spread2 * along + PIXEL2 * (spread2 * (own.x + own.y) + PIXEL2);
     own = spread2 * own + PIXEL2;
     form = vec3(own.yx, spread2 * (lean.x * lean.y - slope.x * slope.y)) / det;
     float radius = @KERNEL_ENDS@ * spread / focal;
-    vec2 half_size = @KERNEL_ENDS@ / (1.0 - min(radius, 0.5)) * sqrt(max(own, 0.0));
+    vec2 half_size = @KERNEL_ENDS@ / (1.0 - min(radius, 0.5)) * sqrt(own);
     gl_PointSize = ceil(2.0 * max(half_size.x, half_size.y)) + 1.0;
     share = spread2 * abs(along) / sqrt(det);
-    farthest = center.z * @BEHIND@ * max(radius, 1.0 / focal) / abs(along);
+    farthest = center.z * @BEHIND@ * max(radius, 1.0 / focal) / max(abs(along), @SLANTED@);
 }
 #endif
 
