@@ -67,7 +67,7 @@ def view(
 
     title = "pointstream" if model is None else f"{model} - pointstream"
     with Screen(title, size) as screen:
-        viewer = Viewer(open_feed, options, settings)
+        viewer = Viewer(open_feed, options, settings, wake=Screen.wake)
         try:
             if model is not None:
                 viewer.open(model)

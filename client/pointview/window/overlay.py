@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 AXES = (("x", (232, 92, 84)), ("y", (112, 190, 92)), ("z", (96, 148, 240)))
 TEXT, SHADE, YELLOW, RED = (230, 230, 230), (18, 21, 26), (255, 214, 10), (232, 64, 56)
 
+PREPARING = "getting ready to draw ... (some seconds at the first use after an installation)"
 WELCOME = "Drop a model here, or paste its path or address with Ctrl V"
 
 
@@ -59,6 +60,9 @@ class Overlay:
         """Draw everything."""
         if viewer.mirror.index is None:
             self._notice(viewer.message or ("opening ..." if viewer.feed is not None else WELCOME))
+            return
+        if viewer.frame is None:
+            self._notice(PREPARING)
             return
         settings, view, crs = viewer.settings, viewer.view, viewer.mirror.header.crs
         if view is not None and settings.marks and self.bottom > 14 * self.letter:

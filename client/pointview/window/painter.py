@@ -6,12 +6,14 @@ always the current one. A frame waits for its picture there, never for data: all
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
 from pointview.colouring import Colouring, available_modes
 from pointview.render import Kind, open_backend
 from pointview.render.picture import tint_starved
+from pointview.render.seen import pixels_by_cell
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,19 +38,37 @@ class Painter:
     ----------
     colouring : Colouring or None
         The present mode; None before the first frame.
+    ready : bool
+        Whether the next frame is drawn as quickly as all later ones.
     """
 
-    def __init__(self, kind: Kind, *, threads: int) -> None:
-        self._kind, self._threads = kind, threads
+    def __init__(self, kind: Kind, *, threads: int, wake: Callable[[], None] = lambda: None) -> None:
+        self._kind, self._threads, self._wake = kind, threads, wake
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="paint")
         self._backend: Backend | None = None
         self._key: tuple[object, ...] = ()
+        self._first: Future[None] | None = None
+        self.ready = False
         self.colouring: Colouring | None = None
 
     @property
     def name(self) -> str:
         """What draws."""
         return "" if self._backend is None else self._backend.name
+
+    def prepare(self, cut: Cut, mirror: Mirror, camera: Camera, settings: Settings) -> bool:
+        """Draw for the first time without waiting; True once that is done.
+
+        After an installation kernels are compiled at their first use, which takes seconds.
+        """
+        if self._first is None:
+            here = replace(mirror, clouds=dict(mirror.clouds))  # the frame loop changes its own meanwhile
+            self._first = self._thread.submit(self._try, cut, here, camera, settings)
+            self._first.add_done_callback(lambda _: self._wake())
+        elif not self.ready and self._first.done():
+            self._first.result()
+            self.ready = True
+        return self.ready
 
     def draw(self, cut: Cut, mirror: Mirror, camera: Camera, settings: Settings) -> Frame:
         """Draw a cut of what the mirror holds."""
@@ -62,6 +82,9 @@ class Painter:
         """Give back the renderer's memory and contexts."""
         self._thread.submit(self._forget).result()
         self._thread.shutdown()
+
+    def _try(self, cut: Cut, mirror: Mirror, camera: Camera, settings: Settings) -> None:
+        pixels_by_cell(self._draw(cut, mirror, camera, settings).depth, cut, camera)
 
     def _draw(self, cut: Cut, mirror: Mirror, camera: Camera, settings: Settings) -> Frame:
         backend, colouring = self._prepared(mirror, settings)

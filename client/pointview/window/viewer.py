@@ -75,6 +75,8 @@ class Viewer:
     ----------
     open_feed : callable
         Makes the feed of a path or address.
+    wake : callable
+        Told, on another thread, when there is something to draw at last.
     """
 
     def __init__(
@@ -83,11 +85,12 @@ class Viewer:
         options: ViewerOptions,
         settings: Settings,
         *,
+        wake: Callable[[], None] = lambda: None,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         self.options, self.settings = options, settings
         self._open_feed, self._clock = open_feed, clock
-        self.painter = Painter(options.backend, threads=options.threads)
+        self.painter = Painter(options.backend, threads=options.threads, wake=wake)
         self.feed: Feed | None = None
         self.mirror = Mirror()
         self.quality = Quality.at(settings.tolerance)
@@ -164,7 +167,7 @@ class Viewer:
         picture = None
         if news or self._redraw or self.culling.changed or state != self._drawn:
             picture = self._draw(moving=moving)
-            self._drawn = state
+            self._drawn = () if picture is None else state
         elif self.cut is not None and self.frame is not None and not self.culling.settled:
             self.painter.run(partial(self.culling.look, self.cut, self.view.camera, self.frame))
         if now - self._share_at > SHARE_EVERY:
@@ -172,16 +175,19 @@ class Viewer:
             self.loaded = loaded_bytes(self.mirror, self.view.camera, self.settings, self.culling.hidden)
         return picture
 
-    def _draw(self, *, moving: bool) -> NDArray[np.uint8]:
+    def _draw(self, *, moving: bool) -> NDArray[np.uint8] | None:
         assert self.view is not None
         camera, first = self.view.camera, self.frame is None
         start = self._clock()
-        self._show(camera, moving=moving)
-        assert self.cut is not None
-        assert self.frame is not None
+        self.cut = self._refined(camera, moving=moving)
+        if not self.painter.prepare(self.cut, self.mirror, camera, self.settings):
+            self._redraw = False
+            return None
+        self.frame = self.painter.draw(self.cut, self.mirror, camera, self.settings)
         drew = partial(self.culling.drew, self.cut, camera, self.frame, seconds=self._clock() - start)
         if self.painter.run(drew):
-            self._show(camera, moving=moving)  # with what shows up (LPC 4: the third pass)
+            self.cut = self._refined(camera, moving=moving)  # with what shows up (LPC 4: the third pass)
+            self.frame = self.painter.draw(self.cut, self.mirror, camera, self.settings)
         seconds = self.drawing = self._clock() - start
         # What compiles or uploads says nothing about the next frame.
         settled = not first and self.frame.uploads * 4 <= self.frame.clouds
@@ -190,20 +196,20 @@ class Viewer:
         self.scene = _seen(self.scene, self.frame, camera)
         return shown(self.frame, self.settings)
 
-    def _show(self, camera: Camera, *, moving: bool) -> None:
-        """Refine, ask and draw."""
+    def _refined(self, camera: Camera, *, moving: bool) -> Cut:
+        """Compute the cut of a frame, and ask for what it wants."""
         assert self.feed is not None
         assert self.mirror.index is not None
         self.culling.prepare(self.mirror.index, wanted=self.settings.occlusion)
-        self.cut = self.quality.cut(self.mirror, camera, self.settings, self.culling.hidden, moving=moving)
+        cut = self.quality.cut(self.mirror, camera, self.settings, self.culling.hidden, moving=moving)
         view = View(
             camera=camera,
             tolerance=self.quality.tolerance,
             cull_backfaces=not self.settings.two_sided,
             hidden=self.culling.hidden,
         )
-        self.feed.ask(self.mirror.build, self.cut.asks, self.cut.nodes, view)
-        self.frame = self.painter.draw(self.cut, self.mirror, camera, self.settings)
+        self.feed.ask(self.mirror.build, cut.asks, cut.nodes, view)
+        return cut
 
     def _place(self, did: Inputs, now: float) -> None:
         """Move the camera; place it first where the model is new."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from oracles import surfaces
 from support import models
+from support.display import until
 
 from lpc.points import PointBatch
 from pointview.camera import Camera
@@ -16,6 +18,7 @@ from pointview.refine import refine
 from pointview.render import open_backend
 from pointview.window.inputs import Inputs
 from pointview.window.mirror import Came, Failed, Opened
+from pointview.window.painter import Painter
 from pointview.window.settings import Settings
 from pointview.window.viewer import Viewer, ViewerOptions
 
@@ -79,6 +82,7 @@ class Session:
 
     def rest(self, most=200):
         """Frames until there is nothing to do any more."""
+        until(lambda: (self.frame(), self.viewer.painter.ready)[1])
         for number in range(most):
             self.frame()
             if not self.viewer.busy and not self.feed.wanting:
@@ -210,3 +214,18 @@ def test_the_first_view_is_the_asked_one(session):
     one = session()
     one.rest()
     assert one.viewer.view.camera == Camera.from_view(VIEW, width=160, height=160)
+
+
+def test_the_window_lives_while_the_renderer_gets_ready(session, monkeypatch):
+    """After an installation kernels compile for seconds: frames go on, and so does what they ask for."""
+    compiled = threading.Event()
+    work = Painter._try
+    monkeypatch.setattr(Painter, "_try", lambda *arguments: (compiled.wait(30), work(*arguments))[1])
+    one = session(each=1)
+    for _ in range(5):
+        assert one.frame() is None
+    assert len(one.feed.given) == 4  # all but the frame that opened
+    assert not one.viewer.busy
+    compiled.set()
+    one.rest()
+    assert one.viewer.frame.splats > 0
