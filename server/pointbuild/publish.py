@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from lpc.attributes import Schema
     from lpc.codec import Effort
 
     from .assemble import Nodes
@@ -151,9 +152,12 @@ def _encode(
 ) -> NDArray[np.float64]:
     """Write all clouds in order and fill the records; what positions and attributes cost in some of them."""
     nodes, geometry = records.nodes, records.geometry
-    one = partial(_encode_run, nodes=nodes, geometry=geometry, regions=regions, schema=found.schema, effort=effort)
+    costed = np.unique(np.linspace(0, len(nodes) - 1, COSTED_CLOUDS).astype(int))
+    schema = found.schema
+    one = partial(
+        _encode_run, costed=costed, nodes=nodes, geometry=geometry, regions=regions, schema=schema, effort=effort
+    )
     costs = np.zeros(1 + len(found.schema))
-    costed = set(np.linspace(0, len(nodes) - 1, COSTED_CLOUDS).astype(int).tolist())
     waiting = runs(nodes, RUN_SAMPLES)
     for sizes, checks, reach, spread, part in journal:
         first, stop = waiting.pop(0)
@@ -162,21 +166,26 @@ def _encode(
         clouds.seek(int(sizes.sum(dtype=np.int64)), os.SEEK_CUR)
         progress.advance(int(nodes.samples[first:stop].sum()))
     clouds.truncate()
-    for (first, stop), run in crew.spread(one, waiting):
+    for (first, stop), (run, part) in crew.spread(one, waiting):
         clouds.writelines(run.frames)
         clouds.flush()
         records.add(run)
-        part = np.zeros(len(costs))
-        for node in sorted(costed.intersection(range(first, stop))):
-            part += cloud_costs(run.frames[node - first], int(nodes.samples[node]), found.schema)
         costs += part
         journal.add(run.sizes, run.checks, run.reach, run.spread, part)
         progress.advance(int(nodes.samples[first:stop].sum()))
     return costs
 
 
-def _encode_run(run: tuple[int, int], **shared: Any) -> Run:
-    return encode_run(*run, **shared)
+def _encode_run(
+    run: tuple[int, int], *, costed: NDArray[np.int64], nodes: Nodes, schema: Schema, **shared: Any
+) -> tuple[Run, NDArray[np.float64]]:
+    """Encode a run of nodes; and the `cloud_costs` of those of its clouds that are `costed`."""
+    first, stop = run
+    encoded = encode_run(first, stop, nodes=nodes, schema=schema, **shared)
+    costs = np.zeros(1 + len(schema))
+    for node in costed[(costed >= first) & (costed < stop)].tolist():
+        costs += cloud_costs(encoded.frames[node - first], int(nodes.samples[node]), schema)
+    return encoded, costs
 
 
 def runs(nodes: Nodes, samples: int) -> list[tuple[int, int]]:

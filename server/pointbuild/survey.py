@@ -19,10 +19,10 @@ from lpc.errors import ScanError
 from lpc.octahedral import encode_normals
 
 from .readers import finite
-from .spool import Column, Spool
+from .spool import Block, Column, Spool
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator
 
     from numpy.typing import NDArray
 
@@ -138,16 +138,21 @@ def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Pr
     rejected: dict[str, int] = {}
     ranges = {column.name: _Range(column) for column in spool.columns[1:]}
     prepare = partial(_prepare, normal_bits=precision.normal_bits)
-    for batch, (values, low, high, short, dropped) in crew.map(prepare, batches):
-        for reason, count in dropped.items():
-            rejected[reason] = rejected.get(reason, 0) + count
-        single = single and short
-        np.minimum(box[0], low, out=box[0])
-        np.maximum(box[1], high, out=box[1])
-        for name, found in ranges.items():
-            found.add(values[name])
-        spool.append(values)
-        progress.advance(len(batch))
+
+    def looked_at() -> Iterator[tuple[Block, dict[str, NDArray[Any]], int]]:
+        nonlocal single
+        for batch, (values, low, high, short, dropped) in crew.map(prepare, batches):
+            for reason, count in dropped.items():
+                rejected[reason] = rejected.get(reason, 0) + count
+            single = single and short
+            np.minimum(box[0], low, out=box[0])
+            np.maximum(box[1], high, out=box[1])
+            for name, found in ranges.items():
+                found.add(values[name])
+            yield spool.reserve(len(values["xyz"])), values, len(batch)
+
+    for (_, _, count), _ in crew.map(lambda entry: spool.write(*entry[:2]), looked_at()):
+        progress.advance(count)
     if not spool.samples:
         why = f": all {sum(rejected.values()):,} records are not finite" if rejected else ""
         raise ScanError(f"the input holds no usable sample{why}")
