@@ -78,6 +78,8 @@ def run_loop(
         if picture is not None:
             screen.show(picture)
             pictures += 1
+        elif viewer.frame is None:
+            screen.blank()
         screen.rename(viewer.title)
         panel.draw(viewer, screen.renderer)
         Overlay.beside(inset).show(viewer)

@@ -179,6 +179,7 @@ def _statistics(viewer: Viewer, renderer: str) -> None:
             ("ahead", f"{written_bytes(stats.speculative_bytes)}, {written_bytes(stats.wasted_bytes)} not drawn"),
             ("in memory", f"{stats.resident_clouds:,} clouds, {written_bytes(stats.resident_bytes)}"),
         ]
+        rows += [("trouble", f"{error.text} ({error.count} times)") for error in stats.errors[:3]]
     if viewer.view is not None:
         rows.append(("turns around", ", ".join(f"{value:.7g}" for value in viewer.view.pivot)))
     if imgui.begin_table("statistics", 2):
@@ -190,8 +191,6 @@ def _statistics(viewer: Viewer, renderer: str) -> None:
             imgui.table_next_column()
             imgui.text_wrapped(value)
         imgui.end_table()
-    for error in () if stats is None else stats.errors[:2]:
-        imgui.text_wrapped(f"{error.text} ({error.count})")
     if renderer:
         imgui.text_disabled(f"window: {renderer.partition(' (')[0]}")
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -114,7 +115,7 @@ class Viewer:
         self._close_feed()
         self.mirror, self.view, self.cut, self.frame, self.scene = Mirror(), None, None, None, None
         self.message, self.loaded = "", (0, 0)
-        self.settings.up = None
+        self.settings.up, self.settings.help = None, False
         self.feed = self._open_feed(target)
 
     def close(self) -> None:
@@ -133,6 +134,17 @@ class Viewer:
         if self.settings.up is not None:
             return self.settings.up
         return "y" if self.mirror.index is None or self.mirror.header.crs is None else "z"
+
+    @property
+    def trouble(self) -> str:
+        """What keeps data from coming, in a line; empty if nothing does."""
+        stats = None if self.feed is None else self.feed.stats
+        return stats.errors[0].text if stats is not None and stats.errors else ""
+
+    @property
+    def loading(self) -> bool:
+        """Whether more of the view is to come."""
+        return self.feed is not None and self.feed.wanting and self.loaded[0] < self.loaded[1]
 
     @property
     def turning(self) -> bool:
@@ -240,7 +252,7 @@ class Viewer:
     def _obey(self, did: Inputs) -> None:
         """Do what keys and drops command besides moving the camera."""
         settings = self.settings
-        for target in did.dropped[:1]:
+        for target in map(tidied, did.dropped[:1]):
             if target.lower().endswith(SCANS):
                 name = Path(target).name
                 self._tell(f"{name} is a scan: make a model of it with `pointstream build {name} -o MODEL.lpc`")
@@ -314,6 +326,16 @@ class Viewer:
             self.feed.close()
             self.longest_handover = max(self.longest_handover, self.feed.longest_handover)
             self.feed = None
+
+
+def tidied(target: str) -> str:
+    """Return the path or address in what was dropped or pasted: its first line, without quotes, of a file: address."""
+    line = target.strip().partition("\n")[0].strip()
+    if len(line) > 1 and line[0] == line[-1] and line[0] in "'\"":
+        line = line[1:-1]
+    if line.startswith("file://"):
+        return unquote(line.removeprefix("file://").removeprefix("localhost"))
+    return line
 
 
 def _look(settings: Settings) -> tuple[object, ...]:

@@ -20,7 +20,7 @@ from pointview.window.inputs import Inputs
 from pointview.window.mirror import Came, Failed, Opened
 from pointview.window.painter import Painter
 from pointview.window.settings import Settings
-from pointview.window.viewer import Viewer, ViewerOptions
+from pointview.window.viewer import Viewer, ViewerOptions, tidied
 
 SIZE = (160, 160)
 VIEW = {"eye": [0.4, -2.5, 1.0], "target": [0, 0, 0], "up": [0, 0, 1], "fov_y": 45.0}
@@ -229,3 +229,19 @@ def test_the_window_lives_while_the_renderer_gets_ready(session, monkeypatch):
     compiled.set()
     one.rest()
     assert one.viewer.frame.splats > 0
+
+
+@pytest.mark.parametrize(
+    ("given", "target"),
+    [
+        ("/data/a b.lpc", "/data/a b.lpc"),
+        (" 'C:\\scans\\a.lpc'\n", "C:\\scans\\a.lpc"),
+        ('"/data/a.lpc"', "/data/a.lpc"),
+        ("file:///data/a%20b.lpc\r\nfile:///data/c.lpc", "/data/a b.lpc"),
+        ("file://localhost/data/a.lpc", "/data/a.lpc"),
+        ("https://host/a%20b.lpc?token=x", "https://host/a%20b.lpc?token=x"),
+        ("", ""),
+    ],
+)
+def test_what_was_dropped_or_pasted(given, target):
+    assert tidied(given) == target
