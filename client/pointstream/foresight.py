@@ -49,7 +49,7 @@ class Foresight:
         self.idle += 0 if wanting else nbytes
 
     def came(self, key: int, size: int) -> None:
-        """Note that a cloud (or page ``~key``) of those bytes is complete and can be used."""
+        """Note that a cloud (or page ``~key``) of those bytes, `size` of them, is complete and can be used."""
         if key < 0:
             self._pages[~key] = size
         else:

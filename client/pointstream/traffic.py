@@ -257,6 +257,7 @@ class Traffic:
             wanted = request.range
             if here := build.take_tail(wanted):
                 assembly.feed(wanted.start, here)
+                request.held = len(here)
                 wanted = ByteRange(wanted.start + len(here), wanted.stop)
             data = await self.store.read(wanted, sink)
             self._recovery.answered()
@@ -287,7 +288,7 @@ class Traffic:
                 self._page_arrived(build, ~item.key, data, request, assembly)
             elif not build.residency.resident[item.key] and not build.busy[item.key]:
                 build.busy[item.key] = True
-                done = partial(self._decoded, build, item, data, ahead=request.ahead)
+                done = partial(self._decoded, build, item, data, ahead=request.brings(item) if request.ahead else 0)
                 self.decoder.decode(data, node=item.key, index=build.index, done=done)
         if arrived:
             self.issue()
@@ -304,14 +305,14 @@ class Traffic:
         self.payload += len(data) * build.passed(build.page_item(page), data)
         build.page_came(page)
         if request.ahead:
-            self.foresight.came(~page, len(data))
+            self.foresight.came(~page, request.brings(build.page_item(page)))
         self.wanted.came(self._clock(), ~page)
         if request.range.start == 0:  # the probe: what else the new page shows to lie inside it
             first = page * build.index.header.page_nodes
             nodes = np.arange(first, min(first + build.index.header.page_nodes, len(build.index)))
             self._claim(build, request, assembly, nodes)
 
-    def _decoded(self, build: Build, item: Item, data: bytes, cloud: Cloud | Corrupt, *, ahead: bool) -> None:
+    def _decoded(self, build: Build, item: Item, data: bytes, cloud: Cloud | Corrupt, *, ahead: int) -> None:
         build.busy[item.key] = False
         self._settle()
         if build is not self.build:
@@ -321,8 +322,9 @@ class Traffic:
         else:
             self.payload += len(data) * build.passed(item, data)
             if ahead:
-                self.foresight.came(item.key, len(data))
-            self.foresight.dropped(build.add(item.key, cloud, ahead=ahead and not self.wanted.holds(item.key)))
+                self.foresight.came(item.key, ahead)
+            undrawn = ahead > 0 and not self.wanted.holds(item.key)
+            self.foresight.dropped(build.add(item.key, cloud, ahead=undrawn))
             self.wanted.came(self._clock(), item.key)
         self.issue()
 

@@ -247,11 +247,53 @@ def test_bytes_ahead_are_those_that_the_host_sent_for_them(large_model: bytes) -
         assert stats.speculative_bytes == stats.wasted_bytes == stats.idle_bytes == sum(sent)
         assert stats.speculative_bytes == stats.bytes_received - opened.bytes_received
         assert stats.wanted_seconds == opened.wanted_seconds
-        drawn = nodes[::3]
+        drawn = nodes[3::3]  # not the first, of which the opening brought a part
         layer.end_frame([], pinned=drawn)
         layer.end_frame([], pinned=drawn)
         used = sum(layer.index.size[drawn].tolist())
         assert layer.stats.wasted_bytes == stats.speculative_bytes - used
+
+    over_line(large_model, check)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_run_of_random_frames_is_counted_to_the_byte(
+    large_model: bytes, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Against the requests themselves, and a set of what was ever drawn."""
+    asked: list[Request] = []
+    issue = Scheduler.issue
+
+    def spy(self: Scheduler, *args: Any, **named: Any) -> list[Request]:
+        requests = issue(self, *args, **named)
+        asked.extend(request for request in requests if request.ahead)
+        return requests
+
+    monkeypatch.setattr(Scheduler, "issue", spy)
+    draw = np.random.default_rng(seed)
+
+    async def check(layer: AccessLayer, origin: Origin) -> None:
+        drawn: set[int] = set()
+        for _ in range(90):
+            pinned = draw.permutation(np.flatnonzero(layer.resident))[: draw.integers(0, 8)]
+            wants = draw.permutation(len(layer.index))[: draw.integers(0, 3) * draw.integers(0, 2)]
+            layer.end_frame(wants[~layer.resident[wants]], pinned=pinned)
+            layer.prefetch(draw.permutation(len(layer.index))[: draw.integers(0, 10)])
+            drawn |= set(pinned.tolist())
+            await asyncio.sleep(FRAME)
+        await layer.idle()
+        came = used = 0
+        sent = {exchange.stop: exchange.start for exchange in origin.log}
+        for request in asked:
+            start = sent[request.range.stop]  # later than asked for where the opening had brought the beginning
+            came += request.range.stop - start
+            for item in request.items:
+                nodes = {item.key} if item.key >= 0 else set(range(~item.key * 64, (~item.key + 1) * 64))
+                used += (item.stop - max(item.start, start)) * bool(nodes & drawn)
+        stats = layer.stats
+        assert stats.speculative_bytes == came > 50_000
+        assert stats.wasted_bytes == stats.speculative_bytes - used > 0
+        assert 0 < stats.idle_bytes <= stats.speculative_bytes
 
     over_line(large_model, check)
 
