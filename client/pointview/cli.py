@@ -111,9 +111,9 @@ TOLERANCE = click.option(
 @click.option(
     "--splat",
     type=click.Choice(["square", "round", "disc", "blended"]),
-    default="disc",
+    default="blended",
     show_default=True,
-    help="What samples look like; blended shows the mean of them.",
+    help="What samples look like; blended: a pixel shows the mean of its samples.",
 )
 @click.option(
     "--antialias",
