@@ -300,6 +300,8 @@ class Viewer:
             self.recorder = Recorder(self._clock())
             return
         recorder, self.recorder = self.recorder, None
+        if self.view is not None:
+            recorder.note(self._clock(), self.view.camera, last=True)
         if recorder.entries:
             path = free_name(self.options.folder, f"{self._stem}-path", ".json")
             self._try(lambda: recorder.write(path), path)
