@@ -16,11 +16,12 @@ from pointview.camera import Camera
 from pointview.occlusion import KEPT
 from pointview.refine import refine
 from pointview.render import open_backend
+from pointview.window.commands import tidied
 from pointview.window.inputs import Inputs
 from pointview.window.mirror import Came, Failed, Opened
 from pointview.window.painter import Painter
 from pointview.window.settings import Settings
-from pointview.window.viewer import Viewer, ViewerOptions, tidied
+from pointview.window.viewer import Viewer, ViewerOptions
 
 SIZE = (160, 160)
 VIEW = {"eye": [0.4, -2.5, 1.0], "target": [0, 0, 0], "up": [0, 0, 1], "fov_y": 45.0}
