@@ -30,8 +30,8 @@ COARSEST = 64.0
 TRIAL, GAIN = 1.4, 0.85
 """Factor of the tolerance after which coarsening is judged, and frame time over that before that is a gain."""
 
-FORGET = 1.02
-"""Factor by which, in a frame of a moving camera, the tolerance may again exceed what coarsening was worth."""
+FORGET, MOST_FORGOTTEN = 1.0, 1.1
+"""Share a second, and factor a frame at most, by which a moving camera may again exceed what coarsening was worth."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,7 +71,9 @@ class Feedback:
             Whether the camera moved since the frame before: what was too slow may not be so any more.
         """
         too_slow = 0.0 if moved else self.too_slow
-        worth = min(self.worth * FORGET, COARSEST) if moved else self.worth
+        worth = self.worth
+        if moved:
+            worth = min(worth * min(1.0 + FORGET * seconds, MOST_FORGOTTEN), COARSEST)
         began, before = self.began, self.before
         load = seconds / allowed
         tolerance = self.tolerance
