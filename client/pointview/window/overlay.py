@@ -76,8 +76,8 @@ class Overlay:
             self._legend(colouring.legend, unit_of(crs) if colouring.mode == "height" else "")
         if viewer.recorder is not None:
             self._recording(viewer.recorder.seconds)
-        if viewer.message or viewer.trouble:
-            self._message(viewer.message or viewer.trouble)
+        if viewer.message:
+            self._message(viewer.message)
         if viewer.loading:
             self._load_bar(*viewer.loaded)
 
