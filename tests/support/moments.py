@@ -97,7 +97,7 @@ async def _watch(run: Run, path: Path, every: float, seconds: float) -> list[Mom
                 cut = refine(layer.index, camera, run.tolerance, layer.resident, priority="error")
                 layer.end_frame(cut.asks, pinned=cut.nodes)
                 finished = bool(len(cut.nodes)) and not len(cut.wants)
-                if len(cut.nodes) and (t >= due or finished):
+                if len(cut.nodes) and (t >= due or (finished and not run.moving)):
                     due = t + every
                     seen = traced.Seen.of(run.shell, camera, silhouette=False) if run.moving else still
                     frame = backend.draw(cut, layer.take, camera, Style())
