@@ -15,7 +15,7 @@ the bytes. Each keeps a journal of what it has done, from which a build that was
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, astuple, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,7 +29,9 @@ from .arrays import ArrayScan
 from .cells import Cells
 from .divide import divide
 from .encode import kernels_are_loaded
+from .estimate import Sketch, estimate_spacing
 from .folder import Folder, manifest_of, work_folder
+from .frame import Frame, choose_step
 from .inputs import Inputs, Source, expand, open_inputs
 from .journal import as_array, from_array
 from .options import BuildOptions
@@ -167,17 +169,18 @@ def _build(
         if recalled is None:
             found = survey(inputs.batches(sizes.block), spool, crew, progress)
             told = {"inputs": inputs.to_json(), "sizes": asdict(sizes), "found": found.to_json()}
-            journal.add(as_array(told), np.array([astuple(block) for block in spool.blocks], np.int64))
+            placed = np.array([astuple(block) for block in spool.blocks], np.int64)
+            journal.add(as_array(told), placed, *found.sketch.arrays())
             folder.remove("normals-*")
         else:
-            found = Survey.from_json(told["found"])
+            found = replace(Survey.from_json(told["found"]), sketch=Sketch.from_arrays(recalled[2:]))
             progress.advance(spool.samples)
+        frame = _frame(found, spool, options, folder, crew, progress)
         division = divide(
             spool,
-            Cells.over(found.low, found.high),
+            frame,
             regions,
             found.schema,
-            single=found.single,
             cloud_size=options.cloud_size,
             seed=options.seed,
             bucket_samples=sizes.bucket,
@@ -185,7 +188,23 @@ def _build(
             crew=crew,
             progress=progress,
         )
-        return publish(division, found, inputs, options, folder=folder, out=out, crew=crew, progress=progress)
+        return publish(division, found, frame, inputs, options, folder=folder, out=out, crew=crew, progress=progress)
+
+
+def _frame(found: Survey, spool: Spool, options: BuildOptions, folder: Folder, crew: Crew, progress: Progress) -> Frame:
+    """Choose the lattice."""
+    cells = Cells.over(found.low, found.high)  # in model units
+    journal = folder.journal("frame")
+    recalled = next(iter(journal), None)
+    if recalled is not None:
+        step, spacing = recalled[0].tolist()
+    else:
+        spacing = 0.0
+        if options.position_error is None:
+            spacing = estimate_spacing(spool, cells, found.sketch, options.cloud_size, crew, progress)
+        step = choose_step(spacing, found.low, found.high, options.position_error)
+        journal.add(np.array([step, spacing]))
+    return replace(Frame.over(found.low, found.high, step), spacing=spacing)
 
 
 def _estimate(scan: Scan, *, scratch: Path, options: BuildOptions) -> Scan:
@@ -199,9 +218,9 @@ def _sizes(inputs: Inputs, out: Path, folder: Folder, options: BuildOptions) -> 
     spool_bytes = sum(column.itemsize for column in columns_of(inputs.attributes))
     attribute_bytes = spool_bytes - 24  # codes are never wider than values
     samples = inputs.samples_at_most
-    row_bytes = whole_words(row_start(single=False) + attribute_bytes)
+    row_bytes = whole_words(row_start(short=False) + attribute_bytes)
     sizes = memory.choose_sizes(options, samples, row_bytes, memory.resident_bytes())
-    stored = whole_words(row_start(single=inputs.single) + attribute_bytes)
+    stored = whole_words(row_start(short=True) + attribute_bytes)  # more only where an outlier is
     disk.check_space(
         disk.predict(samples, stored, attribute_bytes, (sizes.threads + 2) * sizes.bucket),
         folder.path,

@@ -16,11 +16,8 @@ from numba import njit
 
 from lpc.bounds import decode_centers, quantise_cones, quantise_spheres
 from lpc.codec import Effort, encode_clouds
-from lpc.lattice import quantise
 from lpc.octahedral import decode_normals, encode_normals
 from lpc.page import RECORD
-
-from .rows import positions
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,6 +25,7 @@ if TYPE_CHECKING:
     from lpc.attributes import Schema
 
     from .assemble import Nodes
+    from .frame import Frame
     from .rows import Rows
 
 
@@ -53,10 +51,12 @@ class Geometry:
     axis: NDArray[np.float32]
 
     @classmethod
-    def of(cls, nodes: Nodes, origin: NDArray[np.float64], high: NDArray[np.float64], step: float) -> Geometry:
-        """Choose centres and axes; the lattice begins at the corner `origin` of the box up to `high`."""
-        side = float((high - origin).max()) * (1 + 2.0**-20) or 1.0
-        center = nodes.box[:, :3] + (nodes.box[:, 3:] - nodes.box[:, :3]) / 2
+    def of(cls, nodes: Nodes, frame: Frame) -> Geometry:
+        """Choose centres and axes."""
+        origin, step = frame.origin, frame.step
+        top = np.maximum(frame.high, nodes.box[0, 3:] * step + origin)
+        side = float((top - origin).max()) * (1 + 2.0**-20) or 1.0
+        center = (nodes.box[:, :3] + nodes.box[:, 3:]) * (step / 2) + origin
         codes = np.clip(np.rint((center - origin) * (2.0**32 / side)), 0, 2**32 - 1).astype(np.uint32)
         length = np.sqrt((nodes.normals.astype(np.float64) ** 2).sum(axis=1))
         whole = (nodes.bare == 0) & (length > 0)
@@ -104,7 +104,7 @@ def encode_run(
         count = int(nodes.run_count[run])
         regions.read(int(nodes.run_first[run]), rows[at : at + count])
         at += count
-    lattice = quantise(positions(rows), geometry.origin, geometry.step)
+    lattice = rows["xyz"].astype(np.int64)
     codes = {attribute.name: rows[attribute.name] for attribute in schema}
     frames = encode_clouds(lattice, codes, bounds, schema, effort=effort)
     shape = (stop - first, int(nodes.depth[first:stop].max()) + 1)

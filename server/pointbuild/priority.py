@@ -1,7 +1,9 @@
 """The seeded hash that picks the samples of a node.
 
 A node takes the M samples of smallest priority in its cell that no ancestor has taken: a uniform subsample
-(LPC 5) that depends on the samples' places in the input and the seed, not on the order of work.
+(LPC 5). The priority of a sample is a hash of what the model keeps of it, its lattice point and its codes. So it
+depends neither on the order of the input nor on the order of work, and a sample decoded from a model has it still.
+Samples that are equal in everything share a priority; which of them a node takes cannot be told.
 """
 
 from __future__ import annotations
@@ -18,22 +20,22 @@ _GOLDEN = 0x9E3779B97F4A7C15
 _WORD = (1 << 64) - 1
 
 
-def priorities(first: int, count: int, seed: int) -> NDArray[np.uint64]:
-    """Priorities of samples `first` to `first + count - 1` of the input: all different, uniform over 64 bits.
+def priorities(words: NDArray[np.uint64], seed: int) -> NDArray[np.uint64]:
+    """Priorities of samples: uniform over 64 bits.
 
     Parameters
     ----------
-    first, count : int
-        Places in the input after rejected records have been dropped.
+    words : ndarray, (n, w) uint64
+        What there is of each sample.
     seed : int
-        Any 64-bit number. It is mixed before it meets the place: close seeds give unrelated subsamples.
+        Any 64-bit number. It is mixed before it meets a sample: close seeds give unrelated subsamples.
 
     Returns
     -------
-    ndarray, (count,) uint64
+    ndarray, (n,) uint64
     """
-    out = np.empty(count, np.uint64)
-    _fill(np.uint64((first + _mixed(_mixed(seed + _GOLDEN) + _GOLDEN)) & _WORD), out)
+    out = np.empty(len(words), np.uint64)
+    _fill(np.uint64(_mixed(_mixed(seed + _GOLDEN) + _GOLDEN)), words, out)
     return out
 
 
@@ -45,11 +47,13 @@ def _mixed(value: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _fill(first: Any, out: Any) -> None:
-    # Two rounds of the finaliser of SplitMix64 (Steele, Lea and Flood 2014): a bijection, so nothing ties.
-    for i in range(len(out)):
-        value = first + np.uint64(i)
-        for _ in range(2):
+def _fill(seed: Any, words: Any, out: Any) -> None:
+    # A round of the finaliser of SplitMix64 (Steele, Lea and Flood 2014) for each word, and one more.
+    for i in range(len(words)):
+        value = seed
+        for word in range(words.shape[1] + 1):
+            if word < words.shape[1]:
+                value ^= words[i, word]
             value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
             value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
             value = (value ^ (value >> np.uint64(31))) + np.uint64(0x9E3779B97F4A7C15)

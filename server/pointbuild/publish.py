@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from lpc.errors import BuildError
 from lpc.header import Header
-from lpc.lattice import EPSILON, SLACK, position_error_bound, position_step
+from lpc.lattice import position_error_bound
 
 from .costs import KINDS, cloud_costs, seal_with_costs
 from .encode import Geometry, Records, Run, encode_run, normal_vectors
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
     from .assemble import Nodes
     from .divide import Division
     from .folder import Folder
+    from .frame import Frame
     from .inputs import Inputs
     from .journal import Journal
     from .options import BuildOptions
@@ -47,6 +47,7 @@ COSTED_CLOUDS = 256
 def publish(
     division: Division,
     found: Survey,
+    frame: Frame,
     inputs: Inputs,
     options: BuildOptions,
     *,
@@ -59,8 +60,8 @@ def publish(
 
     Parameters
     ----------
-    division, found, inputs
-        The tree, what the survey found, and what is known of the scans.
+    division, found, frame, inputs
+        The tree, what the survey found, the lattice, and what is known of the scans.
     options : BuildOptions
     folder : Folder
         Keeps the clouds until they are all there, and the journal of them.
@@ -68,17 +69,9 @@ def publish(
         The model.
     crew, progress
         Threads, and who is told.
-
-    Raises
-    ------
-    BuildError
-        If no lattice can hold the samples within the wanted error.
     """
-    nodes = division.nodes
-    extent = float((found.high - found.low).max())
-    far = float(np.abs([found.low, found.high]).max())
-    step = choose_step(division.spacing, extent, options.position_error, far=far)
-    geometry = Geometry.of(nodes, found.low, found.high, step)
+    nodes, step = division.nodes, frame.step
+    geometry = Geometry.of(nodes, frame)
     spacing, ratio = node_spacings(nodes, division.spacing, step)
     progress.stage("encode", int(nodes.subtree[0]))
     path = folder.path / "clouds"
@@ -94,12 +87,12 @@ def publish(
             levels=int(nodes.depth.max()) + 1,
             cloud_size=options.cloud_size,
             page_nodes=options.page_nodes,
-            origin=_triple(found.low),
+            origin=_triple(frame.origin),
             step=step,
             side=geometry.side,
             bounds=(*_triple(found.low), *_triple(found.high)),
-            spacing=division.spacing,
-            position_error=position_error_bound(step, found.low, extent),
+            spacing=frame.spacing or division.spacing * step,
+            position_error=position_error_bound(step, frame.origin, geometry.side),
             attributes=found.schema,
             constants=found.constants,
             crs=inputs.crs,
@@ -115,28 +108,6 @@ def publish(
         write_model(out, folder.part_of(out), header, finished, clouds)
     progress.advance(header.samples)
     return header
-
-
-def choose_step(spacing: float, extent: float, position_error: float | None, *, far: float = 0.0) -> float:
-    """Edge of a lattice cell.
-
-    Samples that all coincide are the lattice's origin, whatever its step: it is what float64 tells apart at the
-    largest coordinate, `far`.
-
-    Raises
-    ------
-    BuildError
-        If half the spacing as a bound takes more bits than a coordinate has, or the wanted error does.
-    """
-    if position_error is None and extent == 0.0:
-        return EPSILON * (far or 1.0)
-    step = position_step(spacing, extent, position_error)
-    if position_error is None and spacing > 0 and step > SLACK * spacing:
-        raise BuildError(
-            f"the samples are {spacing:g} apart but spread over {extent:g}, more than 48 bits a coordinate can tell: "
-            "remove the outliers, or allow a larger --position-error"
-        )
-    return step
 
 
 def _encode(

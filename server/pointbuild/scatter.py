@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba import njit
 
-from .priority import priorities
 from .rows import as_words, fill_rows
 from .spool import Block, Spool, read_all, write_all
 
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 
     from lpc.attributes import Schema
 
-    from .cells import Cells
+    from .frame import Frame
     from .plan import Plan
 
 
@@ -159,7 +158,7 @@ class Regions:
 def scatter(
     block: Block,
     spool: Spool,
-    cells: Cells,
+    frame: Frame,
     plan: Plan,
     limits: NDArray[np.uint64],
     seed: int,
@@ -172,7 +171,7 @@ def scatter(
     ----------
     block, spool
         What to read.
-    cells, plan
+    frame, plan
         Where samples belong.
     limits : ndarray, (buckets,) uint64
         Priorities up to these are candidates.
@@ -182,11 +181,11 @@ def scatter(
         What rows hold and look like.
     """
     values = spool.read(block, ("xyz", *(attribute.name for attribute in schema)))
-    priority = priorities(block.first, block.samples, seed)
-    rows = fill_rows(dtype, values, priority, schema)
-    bucket = plan.locate(cells, values["xyz"])
+    places = frame.places(values["xyz"])
+    rows = fill_rows(dtype, places, values, schema, seed)
     if len(plan.buckets) == 1:
         return Scattered(rows, np.array([block.samples]), Candidates(np.empty(0, np.uint64), np.empty(0, np.int32)))
+    bucket, priority = plan.locate(frame.cells, places), rows["priority"]
     counts = np.bincount(bucket, minlength=len(plan.buckets))
     out = np.empty_like(rows)
     _sort_rows(as_words(rows), bucket, np.cumsum(counts) - counts, as_words(out))

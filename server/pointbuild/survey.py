@@ -6,7 +6,7 @@ That is the bounding box, the records to reject, which attributes are constant, 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from lpc.constants import Constant
 from lpc.errors import ScanError
 from lpc.octahedral import encode_normals
 
+from .estimate import Sketch
 from .readers import finite
 from .spool import Column, Spool
 
@@ -49,8 +50,8 @@ class Survey:
         Attributes that turned out to say nothing.
     rejected : dict of str to int
         Dropped records by reason.
-    single : bool
-        All coordinates are float32 numbers.
+    sketch : Sketch
+        Random samples.
     """
 
     low: NDArray[np.float64]
@@ -59,17 +60,16 @@ class Survey:
     constants: dict[str, Constant]
     left_out: dict[str, str]
     rejected: dict[str, int]
-    single: bool = False
+    sketch: Sketch = field(default_factory=Sketch)
 
     def to_json(self) -> dict[str, Any]:
-        """Give everything as plain values; numbers keep all their bits."""
+        """Give everything but the sketch as plain values; numbers keep all their bits."""
         return {
             "box": [self.low.tolist(), self.high.tolist()],
             "schema": [attribute.to_json() for attribute in self.schema],
             "constants": {name: constant.to_json() for name, constant in self.constants.items()},
             "left_out": self.left_out,
             "rejected": self.rejected,
-            "single": self.single,
         }
 
     @classmethod
@@ -83,7 +83,6 @@ class Survey:
             {name: Constant.from_json(constant) for name, constant in entry["constants"].items()},
             entry["left_out"],
             entry["rejected"],
-            entry["single"],
         )
 
 
@@ -117,13 +116,13 @@ def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Pr
         If no sample is left.
     """
     box = np.array([[np.inf] * 3, [-np.inf] * 3])
-    single = True
+    sketch = Sketch()
     rejected: dict[str, int] = {}
     ranges = {column.name: _Range(column) for column in spool.columns[1:]}
-    for batch, (values, low, high, short, dropped) in crew.map(_prepare, batches):
+    for batch, (values, low, high, drawn, dropped) in crew.map(_prepare, batches):
         for reason, count in dropped.items():
             rejected[reason] = rejected.get(reason, 0) + count
-        single = single and short
+        sketch.add(drawn)
         np.minimum(box[0], low, out=box[0])
         np.maximum(box[1], high, out=box[1])
         for name, found in ranges.items():
@@ -142,36 +141,35 @@ def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Pr
             constants[name] = verdict
         else:
             left_out[name] = verdict
-    return Survey(box[0], box[1], tuple(schema), constants, left_out, {k: v for k, v in rejected.items() if v}, single)
+    return Survey(box[0], box[1], tuple(schema), constants, left_out, {k: v for k, v in rejected.items() if v}, sketch)
 
 
-def _prepare(batch: PointBatch) -> tuple[dict[str, NDArray[Any]], NDArray[Any], NDArray[Any], bool, dict[str, int]]:
-    """Give the samples of a batch as columns, their box, whether they are float32 numbers, and what was dropped."""
+def _prepare(batch: PointBatch) -> tuple[dict[str, NDArray[Any]], NDArray[Any], NDArray[Any], Sketch, dict[str, int]]:
+    """Give the samples of a batch as columns, their box, some of them, and what was dropped."""
     dropped: dict[str, int] = {}
     box = np.empty((2, 3))
-    good, single = _box(batch.xyz, box)
+    good = _box(batch.xyz, box)
     if not good or (batch.normal is not None and not np.isfinite(batch.normal).all()):
         batch, dropped = finite(batch)
-        _, single = _box(batch.xyz, box)
+        _box(batch.xyz, box)
     values: dict[str, NDArray[Any]] = {"xyz": batch.xyz}
     for name, column in batch.attributes.items():
         values[name] = encode_normals(column, NORMAL_BITS) if name == "normal" else column
-    return values, box[0], box[1], single, dropped
+    return values, box[0], box[1], Sketch.of(batch.xyz), dropped
 
 
 @njit(cache=True, nogil=True)
 def _box(xyz: Any, box: Any) -> Any:
-    """Fill in the box of (n, 3) positions; whether all are finite, and whether all are float32 numbers."""
-    good, single = True, True
+    """Fill in the box of (n, 3) positions; whether all are finite."""
+    good = True
     for axis in range(3):
         low, high = np.inf, -np.inf
         for i in range(len(xyz)):
             value = xyz[i, axis]
             low, high = min(low, value), max(high, value)
             good &= abs(value) < np.inf  # false for what is not a number
-            single &= float(np.float32(value)) == value
         box[0, axis], box[1, axis] = low, high
-    return good, single
+    return good
 
 
 class _Range:
