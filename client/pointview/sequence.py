@@ -19,7 +19,7 @@ from pointstream.layer import AccessLayer, LayerOptions
 from pointstream.stores import open_store
 
 from .camera import Camera
-from .render import open_backend
+from .render import antialias, open_backend
 from .render.picture import save_picture
 from .settle import settle
 from .still import CAPACITY, StillOptions, camera_of, cut_of
@@ -152,7 +152,8 @@ async def draw_sequence(
                 look = partial(cut_of, options=one)
                 cut = await settle(layer, look, clock=time.monotonic, patience=options.patience)
                 start = time.perf_counter()
-                frame = backend.draw(cut, layer.take, camera_of(layer, one), options.style)
+                camera = camera_of(layer, one)
+                frame = antialias.draw(backend, cut, layer.take, camera, options.style, finer=options.antialias)
                 drawing += time.perf_counter() - start
                 most = max(most, frame.splats)
                 save_picture(frame.rgb, file)

@@ -89,6 +89,23 @@ def test_other_splats(gl, scene, splat):
     backend.close()
 
 
+@pytest.mark.parametrize("one_draw", [True, False])
+def test_blended_pictures(gl, scene, one_draw):
+    model, camera = scene
+    backend, oracle = gl(model.header, one_draw=one_draw), CpuBackend(model.header)
+    for tolerance, resident, two_sided in (
+        (1.0, model.everything, False),
+        (6.0, model.everything, True),
+        (1.0, model.first(7), False),
+    ):
+        style = Style(splat="blended", two_sided=two_sided, background=(30, 60, 90))
+        cut = refine(model.index, camera, tolerance, resident, cull_backfaces=not two_sided)
+        frame, expected = (one.draw(cut, model.take, camera, style) for one in (backend, oracle))
+        # Another sample that is seen lies at another depth, and lets others count around it.
+        assert_same(frame, expected, 3 * SHARE)
+    backend.close()
+
+
 def test_inside_the_model(gl):
     model = models.torus(8000)
     camera = Camera(eye=(1.0, 0.02, 0.03), target=(1.0, 1.0, 0.2), up=(0, 0, 1), width=120, height=90)
@@ -113,6 +130,9 @@ def test_a_small_arena_gives_the_same_picture_in_several_passes(gl):
         frame = small.draw(cut, model.take, camera, Style())
         np.testing.assert_array_equal(frame.rgb, expected.rgb)
         np.testing.assert_array_equal(frame.node, expected.node)
+    blended = [backend.draw(cut, model.take, camera, Style(splat="blended")).rgb for backend in (small, large)]
+    assert (blended[0] != expected.rgb).any()
+    np.testing.assert_array_equal(*blended)
     small.close()
     large.close()
 

@@ -49,6 +49,14 @@ def test_a_path_becomes_numbered_pictures_and_a_film(model_file, tmp_path, capsy
         assert (film.n_frames, film.size) == (5, (80, 60))
 
 
+def test_a_turntable_of_blended_and_of_antialiased_pictures(model_file, tmp_path, capsys):
+    shown = []
+    for options in ((), ("--splat", "blended"), ("--antialias", 2)):
+        render(capsys, model_file, tmp_path / "o.png", "--turntable", 2, "--animation", "none", *options)
+        shown.append(np.asarray(Image.open(tmp_path / "o-0002.png")).tobytes())
+    assert len(set(shown)) == 3
+
+
 ITS_PIPES = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 """imageio-ffmpeg leaves pipes open."""
 

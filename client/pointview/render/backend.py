@@ -19,9 +19,11 @@ Take = Callable[[int], "Cloud"]
 
 Rgb = tuple[int, int, int]
 
-Splat = Literal["square", "round", "disc"]
+Splat = Literal["square", "round", "disc", "blended"]
 """What a splat of more than a few pixels is: a square of pixels as in the paper, a disc that faces the eye, or a disc
-in the tangent plane of its sample where there is a normal."""
+in the tangent plane of its sample where there is a normal. Blended: such discs, and the mean of all samples that a
+pixel shows instead of the nearest one.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -63,11 +63,11 @@ def view(
     options = ViewerOptions(backend=backend, threads=min(os.cpu_count() or 1, MOST_THREADS), folder=folder, view=view)
 
     def open_feed(target: str) -> Feed:
-        return Feed(target, cache=choose_cache(cache, target), link=profile)
+        return Feed(target, cache=choose_cache(cache, target), link=profile, wake=Screen.wake)
 
     title = "pointstream" if model is None else f"{model} - pointstream"
     with Screen(title, size) as screen:
-        viewer = Viewer(open_feed, options, settings)
+        viewer = Viewer(open_feed, options, settings, wake=Screen.wake)
         try:
             if model is not None:
                 viewer.open(model)

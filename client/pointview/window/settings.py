@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from pointview.render import Splat, Style
 
@@ -36,6 +36,8 @@ class Settings:
     tint : bool
         Starved pixels in yellow.
     splat : Splat
+    occlusion : bool
+        Leave out what is hidden, where that pays.
     two_sided, close_holes : bool
         See `Style`.
     edl_strength : float
@@ -43,8 +45,10 @@ class Settings:
         Dragging turns the head instead of the model.
     speed : float
         Of flying, sizes of the model a second.
-    panel, help : bool
-        What is shown.
+    up : {"y", "z"}, optional
+        The model's vertical; by its header if not given.
+    panel, help, marks : bool
+        What is shown; the marks are axes and scale bar.
     """
 
     tolerance: float = 1.0
@@ -54,13 +58,16 @@ class Settings:
     frame_seconds: float = 0.05
     mode: Mode = "color"
     tint: bool = False
+    occlusion: bool = True
     splat: Splat = Style().splat
     two_sided: bool = False
     close_holes: bool = True
     edl_strength: float = Style().edl_strength
     fly: bool = False
     speed: float = 0.25
+    up: Literal["y", "z"] | None = None
     panel: bool = True
+    marks: bool = True
     help: bool = False
 
     def style(self) -> Style:
