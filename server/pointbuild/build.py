@@ -30,7 +30,8 @@ from .cells import Cells
 from .divide import divide
 from .encode import kernels_are_loaded
 from .estimate import Sketch, estimate_spacing
-from .folder import Folder, manifest_of, work_folder
+from .extend import OldModel
+from .folder import Folder, manifest_of, was_written, work_folder
 from .frame import Frame, choose_step
 from .inputs import Inputs, Source, expand, open_inputs
 from .journal import as_array, from_array
@@ -64,11 +65,14 @@ class BuildReport:
         Wall time.
     peak_rss_bytes : int
         Peak resident size of the process so far.
+    clouds_kept : int
+        Of an older model, as they were.
     """
 
     header: Header
     seconds: float
     peak_rss_bytes: int
+    clouds_kept: int = 0
 
     @property
     def samples_per_second(self) -> float:
@@ -85,6 +89,7 @@ def build_model(
     clock: Callable[[], float],
     tell: Callable[[str], None] = lambda _: None,
     cluster: Cluster | None = None,
+    append: Path | None = None,
 ) -> BuildReport:
     """Build one model of some scans.
 
@@ -102,6 +107,9 @@ def build_model(
         Gets a sentence where a build that was killed left files, and where the scans differ.
     cluster : Cluster, optional
         Workers that sort and encode; without them threads do.
+    append : Path, optional
+        A model that the scans are added to, which may be `out`. It determines the lattice and all options but those
+        of memory, threads, places and the normals of the scans.
 
     Raises
     ------
@@ -115,14 +123,27 @@ def build_model(
     disk.check_target(out)
     progress = progress or Silent()
     sources = expand(sources)
-    manifest = manifest_of(sources, options, GENERATOR)
-    if manifest and cluster:
-        manifest["cluster"] = cluster.url
-    with disk.translated(out), work_folder(options.scratch or out.parent, out, manifest, tell) as folder:
+    old = None if append is None else OldModel.open(append)
+    if old:
+        options = old.options(options)
+    manifest = manifest_of(sources if old is None else [old.path, *sources], options, GENERATOR)
+    if manifest:
+        manifest |= {"cluster": cluster and cluster.url, "append": append is not None}
+    place = options.scratch or out.parent
+    if old and manifest and was_written(place, out, manifest, old.header.digest):
+        tell(f"the scans were added to {out} before the build was stopped: there is nothing left to do")
+        with work_folder(place, out, None, lambda _: None):
+            pass
+        kept = old.header.nodes
+        return BuildReport(
+            header=old.header, seconds=clock() - began, peak_rss_bytes=memory.peak_bytes(), clouds_kept=kept
+        )
+    with disk.translated(out), work_folder(place, out, manifest, tell) as folder:
         if not kernels_are_loaded():
             _warm(folder)
-        header = _build(sources, out, folder, options, progress, cluster, tell)
-    return BuildReport(header=header, seconds=clock() - began, peak_rss_bytes=memory.peak_bytes())
+        header, kept = _build(sources, out, folder, options, progress, cluster, tell, old)
+    seconds = clock() - began
+    return BuildReport(header=header, seconds=seconds, peak_rss_bytes=memory.peak_bytes(), clouds_kept=kept)
 
 
 def _warm(folder: Folder) -> None:
@@ -145,7 +166,8 @@ def _build(
     progress: Progress,
     cluster: Cluster | None = None,
     tell: Callable[[str], None] = lambda _: None,
-) -> Header:
+    old: OldModel | None = None,
+) -> tuple[Header, int]:
     """Go through the stages; what the folder's journals know is not done again."""
     journal = folder.journal("survey")
     recalled = next(iter(journal), None)
@@ -154,20 +176,25 @@ def _build(
         inputs = open_inputs(sources, options, partial(_estimate, scratch=folder.path, options=options))
         for note in inputs.notes:
             tell(note)
-        sizes, blocks = _sizes(inputs, out, folder, options), None
+        if old:
+            inputs = old.join(inputs)
+        sizes, blocks = _sizes(inputs, out, folder, options, owned=old is not None), None
     else:
         told = from_array(recalled[0])
         inputs, sizes = Inputs.from_json(told["inputs"]), memory.Sizes(**told["sizes"])
         blocks = [Block(*block) for block in recalled[1].tolist()]
+    columns = columns_of(inputs.attributes, options.precision, owned=old is not None)
     # The crew comes last and goes first: no thread may hold a file that is closed.
     with (
-        closing(Spool(folder.path / "spool", columns_of(inputs.attributes, options.precision), blocks)) as spool,
+        closing(Spool(folder.path / "spool", columns, blocks)) as spool,
         closing(Regions(folder.path / "rows")) as regions,
         cluster.crew(sizes.threads, folder) if cluster else Crew(sizes.threads) as crew,
     ):
         progress.stage("read", spool.samples or inputs.samples_hint)
         if recalled is None:
             found = survey(inputs.batches(sizes.block), spool, crew, progress, options.precision)
+            if old:
+                found = old.join_survey(found)
             told = {"inputs": inputs.to_json(), "sizes": asdict(sizes), "found": found.to_json()}
             placed = np.array([astuple(block) for block in spool.blocks], np.int64)
             journal.add(as_array(told), placed, *found.sketch.arrays())
@@ -181,6 +208,7 @@ def _build(
             frame,
             regions,
             found.schema,
+            owned=old is not None,
             cloud_size=options.cloud_size,
             seed=options.seed,
             bucket_samples=sizes.bucket,
@@ -188,7 +216,12 @@ def _build(
             crew=crew,
             progress=progress,
         )
-        return publish(division, found, frame, inputs, options, folder=folder, out=out, crew=crew, progress=progress)
+        # Workers of a cluster may not reach the model.
+        clouds = None if old is None or cluster else old.clouds(found, frame, options, GENERATOR)
+        return publish(
+            division, found, frame, inputs, options,
+            folder=folder, out=out, crew=crew, progress=progress, old=clouds,
+        )  # fmt: skip
 
 
 def _frame(found: Survey, spool: Spool, options: BuildOptions, folder: Folder, crew: Crew, progress: Progress) -> Frame:
@@ -200,9 +233,9 @@ def _frame(found: Survey, spool: Spool, options: BuildOptions, folder: Folder, c
         step, spacing = recalled[0].tolist()
     else:
         spacing = 0.0
-        if options.position_error is None:
+        if options.position_error is None and options.step is None:
             spacing = estimate_spacing(spool, cells, found.sketch, options.cloud_size, crew, progress)
-        step = choose_step(spacing, found.low, found.high, options.position_error)
+        step = options.step or choose_step(spacing, found.low, found.high, options.position_error)
         journal.add(np.array([step, spacing]))
     return replace(Frame.over(found.low, found.high, step), spacing=spacing)
 
@@ -213,9 +246,9 @@ def _estimate(scan: Scan, *, scratch: Path, options: BuildOptions) -> Scan:
     return normals.estimate(scan, scratch, options.memory_bytes)
 
 
-def _sizes(inputs: Inputs, out: Path, folder: Folder, options: BuildOptions) -> memory.Sizes:
+def _sizes(inputs: Inputs, out: Path, folder: Folder, options: BuildOptions, *, owned: bool) -> memory.Sizes:
     """Check the disk, and share out the memory."""
-    spool_bytes = sum(column.itemsize for column in columns_of(inputs.attributes, options.precision))
+    spool_bytes = sum(column.itemsize for column in columns_of(inputs.attributes, options.precision, owned=owned))
     attribute_bytes = spool_bytes - 24  # codes are never wider than values
     samples = inputs.samples_at_most
     row_bytes = whole_words(row_start(short=False) + attribute_bytes)

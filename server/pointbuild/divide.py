@@ -55,6 +55,7 @@ def divide(
     regions: Regions,
     schema: Schema,
     *,
+    owned: bool,
     cloud_size: int,
     seed: int,
     bucket_samples: int,
@@ -73,6 +74,8 @@ def divide(
         Gets the rows.
     schema : Schema
         The attributes that rows carry.
+    owned : bool
+        Samples say which cloud of an older model they were in.
     cloud_size, seed : int
         M, and what the priorities hash.
     bucket_samples : int
@@ -88,7 +91,7 @@ def divide(
     most = max(bucket_samples, probing.region)
     plan = _count(spool, frame, cells, most, folder, crew, progress)
     check_piles(plan.buckets)
-    regions.lay_out(row_dtype(schema, short=frame.short), [bucket.count for bucket in plan.buckets])
+    regions.lay_out(row_dtype(schema, short=frame.short, owned=owned), [bucket.count for bucket in plan.buckets])
     regions.restore()
     limits = candidate_limits(plan, cloud_size, slack)
     candidates = _scatter(spool, frame, plan, limits, seed, schema, regions, folder, crew, progress)

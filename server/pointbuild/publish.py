@@ -13,6 +13,7 @@ from lpc.lattice import position_error_bound
 
 from .costs import cloud_costs, seal_with_costs
 from .encode import Geometry, Records, Run, encode_run
+from .extend import PACKING, packing_of
 from .spacing import node_spacings
 from .write import write_model
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
     from .assemble import Nodes
     from .divide import Division
+    from .extend import OldClouds
     from .folder import Folder
     from .frame import Frame
     from .inputs import Inputs
@@ -56,8 +58,9 @@ def publish(
     out: Path,
     crew: Crew,
     progress: Progress,
-) -> Header:
-    """Write the model and give its header.
+    old: OldClouds | None = None,
+) -> tuple[Header, int]:
+    """Write the model; its header, and how many clouds of an older model are in it.
 
     Parameters
     ----------
@@ -70,6 +73,8 @@ def publish(
         The model.
     crew, progress
         Threads, and who is told.
+    old : OldClouds, optional
+        Clouds that need not be encoded.
     """
     nodes, step = division.nodes, frame.step
     geometry = Geometry.of(nodes, frame)
@@ -79,7 +84,8 @@ def publish(
     path.touch()
     with path.open("r+b") as clouds:
         records = Records(nodes, geometry, spacing)
-        costs = _encode(records, clouds, folder.journal("encode"), division.rows, found, options.effort, crew, progress)
+        journal = folder.journal("encode")
+        costs, kept = _encode(records, clouds, journal, division.rows, found, options.effort, old, crew, progress)
         division.rows.remove()  # their room is the model's
         header = Header(
             bytes=2**53,
@@ -102,13 +108,15 @@ def publish(
             spacing_ratio=ratio,
             seed=options.seed,
             generator=GENERATOR,
+            extra={PACKING: packing_of(options)},
         )
         finished = records.finish()
         header = seal_with_costs(header, finished, costs, clouds.tell())
+        folder.note_written(header.digest)
         progress.stage("write", header.samples)
         write_model(out, folder.part_of(out), header, finished, clouds)
     progress.advance(header.samples)
-    return header
+    return header, kept
 
 
 def _encode(
@@ -118,19 +126,25 @@ def _encode(
     regions: Rows,
     found: Survey,
     effort: Effort,
+    old: OldClouds | None,
     crew: Crew,
     progress: Progress,
-) -> NDArray[np.float64]:
-    """Write all clouds in order and fill the records; what positions and attributes cost in some of them."""
+) -> tuple[NDArray[np.float64], int]:
+    """Write all clouds in order and fill the records.
+
+    Returns what positions and attributes cost in some of the clouds, and how many are old.
+    """
     nodes, geometry = records.nodes, records.geometry
     costed = np.unique(np.linspace(0, len(nodes) - 1, COSTED_CLOUDS).astype(int))
     schema = found.schema
     one = partial(
-        _encode_run, costed=costed, nodes=nodes, geometry=geometry, regions=regions, schema=schema, effort=effort
-    )
+        _encode_run, costed=costed, nodes=nodes, geometry=geometry, regions=regions, schema=schema, effort=effort,
+        old=old,
+    )  # fmt: skip
     costs = np.zeros(1 + len(found.schema))
-    waiting = runs(nodes, RUN_SAMPLES)
-    for sizes, checks, reach, spread, part in journal:
+    waiting, kept = runs(nodes, RUN_SAMPLES), 0
+    for sizes, checks, reach, spread, part, same in journal:
+        kept += int(same)
         first, stop = waiting.pop(0)
         records.add(Run(first, [], sizes, checks, reach, spread))
         costs += part
@@ -142,9 +156,10 @@ def _encode(
         clouds.flush()
         records.add(run)
         costs += part
-        journal.add(run.sizes, run.checks, run.reach, run.spread, part)
+        kept += run.kept
+        journal.add(run.sizes, run.checks, run.reach, run.spread, part, np.array(run.kept))
         progress.advance(int(nodes.samples[first:stop].sum()))
-    return costs
+    return costs, kept
 
 
 def _encode_run(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from .extend import OWNER
 from .priority import priorities
 
 if TYPE_CHECKING:
@@ -55,10 +56,10 @@ class Rows(Protocol):
         """Remove the files."""
 
 
-def row_dtype(schema: Schema, *, short: bool = True) -> np.dtype[Any]:
+def row_dtype(schema: Schema, *, short: bool = True, owned: bool = False) -> np.dtype[Any]:
     """Fields ``priority``, ``xyz`` and one per attribute, widest first, padded to whole words.
 
-    `short`: lattice coordinates have 32 bits.
+    `short`: lattice coordinates have 32 bits. `owned`: there is also `OWNER`, in a word of its own.
     """
     names, formats, offsets = ["priority", "xyz"], ["<u8", "(3,)<i4" if short else "(3,)<i8"], [0, 8]
     end = row_start(short)
@@ -70,6 +71,11 @@ def row_dtype(schema: Schema, *, short: bool = True) -> np.dtype[Any]:
         formats.append(f"{shape}<u{item.itemsize}")
         offsets.append(end)
         end += item.itemsize * attribute.components
+    if owned:
+        names.append(OWNER)
+        formats.append("<u4")
+        offsets.append(whole_words(end))
+        end = offsets[-1] + 8
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": whole_words(end)})
 
 
@@ -110,7 +116,10 @@ def fill_rows(
     for attribute in schema:
         column = values[attribute.name]
         rows[attribute.name] = column if attribute.kind == "normal" else encode_values(attribute, column)
-    rows["priority"] = priorities(as_words(rows)[:, 1:], seed)
+    words = as_words(rows)
+    rows["priority"] = priorities(words[:, 1:-1] if OWNER in values else words[:, 1:], seed)
+    if OWNER in values:
+        rows[OWNER] = values[OWNER]
     return rows
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba import njit
 
+from .extend import OWNER
 from .rows import as_words, fill_rows
 from .spool import Block, Spool, read_all, write_all
 
@@ -185,7 +186,7 @@ def scatter(
     schema, dtype
         What rows hold and look like.
     """
-    values = spool.read(block, ("xyz", *(attribute.name for attribute in schema)))
+    values = spool.read(block, ("xyz", OWNER, *(attribute.name for attribute in schema)))
     places = frame.places(values["xyz"])
     rows = fill_rows(dtype, places, values, schema, seed)
     if len(plan.buckets) == 1:

@@ -19,6 +19,7 @@ from lpc.errors import ScanError
 from lpc.octahedral import encode_normals
 
 from .estimate import Sketch
+from .extend import OWNER
 from .readers import finite
 from .spool import Block, Column, Spool
 
@@ -101,8 +102,8 @@ class Survey:
         )
 
 
-def columns_of(attributes: dict[str, np.dtype[Any]], precision: Precision) -> tuple[Column, ...]:
-    """Columns of the spool: positions as they came, normals as codes, everything else as it came."""
+def columns_of(attributes: dict[str, np.dtype[Any]], precision: Precision, *, owned: bool) -> tuple[Column, ...]:
+    """Columns of the spool: positions as they came, normals as codes, everything else as it came, and `OWNER`."""
     columns = [Column("xyz", np.dtype("<f8"), 3)]
     for name, dtype in attributes.items():
         if name == "normal":
@@ -110,7 +111,7 @@ def columns_of(attributes: dict[str, np.dtype[Any]], precision: Precision) -> tu
             columns.append(Column(name, np.dtype(code), 2))
         else:
             columns.append(Column(name, dtype.newbyteorder("<"), 3 if name == "color" else 1))
-    return tuple(columns)
+    return (*columns, Column(OWNER, np.dtype("<u4"))) if owned else tuple(columns)
 
 
 def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Progress, precision: Precision) -> Survey:
@@ -135,7 +136,7 @@ def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Pr
     box = np.array([[np.inf] * 3, [-np.inf] * 3])
     sketch = Sketch()
     rejected: dict[str, int] = {}
-    ranges = {column.name: _Range(column) for column in spool.columns[1:]}
+    ranges = {column.name: _Range(column) for column in spool.columns[1:] if column.name != OWNER}
     prepare = partial(_prepare, normal_bits=precision.normal_bits)
 
     def looked_at() -> Iterator[tuple[Block, dict[str, NDArray[Any]], int]]:
