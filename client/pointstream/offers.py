@@ -34,11 +34,17 @@ class Request:
     """No frame wanted any of it when it was asked for."""
     landed: int = 0
     """Bytes that have arrived."""
+    held: int = 0
+    """Bytes of its beginning that were here before."""
 
     @property
     def outstanding(self) -> int:
         """Bytes that have not arrived."""
         return self.range.size - self.landed
+
+    def brings(self, item: Item) -> int:
+        """Bytes of an item that were not here before."""
+        return item.stop - max(item.start, self.range.start + self.held)
 
 
 class Offer:

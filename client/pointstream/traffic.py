@@ -54,6 +54,8 @@ class Traffic:
     errors : ErrorLog
     received, requests, payload : int
         Bytes that came, requests that brought any, bytes that were used.
+    idle_bytes : int
+        Bytes that came while no frame wanted anything: ahead, or for a view that the camera has left.
     stopped : bool
         Nothing is asked for any more.
     """
@@ -67,7 +69,7 @@ class Traffic:
         self.wanted = Wanted(clock())
         self.foresight = Foresight()
         self.errors = ErrorLog()
-        self.received = self.requests = self.payload = 0
+        self.received = self.requests = self.payload = self.idle_bytes = 0
         self.stopped = False
         self._options, self._clock = options, clock
         self._recovery = Recovery(options.recovery)
@@ -257,6 +259,7 @@ class Traffic:
             wanted = request.range
             if here := build.take_tail(wanted):
                 assembly.feed(wanted.start, here)
+                request.held = len(here)
                 wanted = ByteRange(wanted.start + len(here), wanted.stop)
             data = await self.store.read(wanted, sink)
             self._recovery.answered()
@@ -273,7 +276,9 @@ class Traffic:
             self.requests += 1
         self.received += len(chunk)
         if request.ahead:
-            self.foresight.landed(len(chunk), wanting=self.wanted.anything)
+            self.foresight.landed(len(chunk))
+        if not self.wanted.anything:
+            self.idle_bytes += len(chunk)
         scheduler.landed(request, assembly.feed(offset, chunk))
 
     def _arrive(self, build: Build, request: Request, assembly: Assembly) -> None:
@@ -287,7 +292,7 @@ class Traffic:
                 self._page_arrived(build, ~item.key, data, request, assembly)
             elif not build.residency.resident[item.key] and not build.busy[item.key]:
                 build.busy[item.key] = True
-                done = partial(self._decoded, build, item, data, ahead=request.ahead)
+                done = partial(self._decoded, build, item, data, ahead=request.brings(item) if request.ahead else 0)
                 self.decoder.decode(data, node=item.key, index=build.index, done=done)
         if arrived:
             self.issue()
@@ -304,14 +309,14 @@ class Traffic:
         self.payload += len(data) * build.passed(build.page_item(page), data)
         build.page_came(page)
         if request.ahead:
-            self.foresight.came(~page, len(data))
+            self.foresight.came(~page, request.brings(build.page_item(page)))
         self.wanted.came(self._clock(), ~page)
         if request.range.start == 0:  # the probe: what else the new page shows to lie inside it
             first = page * build.index.header.page_nodes
             nodes = np.arange(first, min(first + build.index.header.page_nodes, len(build.index)))
             self._claim(build, request, assembly, nodes)
 
-    def _decoded(self, build: Build, item: Item, data: bytes, cloud: Cloud | Corrupt, *, ahead: bool) -> None:
+    def _decoded(self, build: Build, item: Item, data: bytes, cloud: Cloud | Corrupt, *, ahead: int) -> None:
         build.busy[item.key] = False
         self._settle()
         if build is not self.build:
@@ -321,8 +326,9 @@ class Traffic:
         else:
             self.payload += len(data) * build.passed(item, data)
             if ahead:
-                self.foresight.came(item.key, len(data))
-            self.foresight.dropped(build.add(item.key, cloud, ahead=ahead and not self.wanted.holds(item.key)))
+                self.foresight.came(item.key, ahead)
+            undrawn = ahead > 0 and not self.wanted.holds(item.key)
+            self.foresight.dropped(build.add(item.key, cloud, ahead=undrawn))
             self.wanted.came(self._clock(), item.key)
         self.issue()
 

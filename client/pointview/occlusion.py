@@ -129,7 +129,7 @@ class Occlusion:
         """Nodes whose samples are near enough to each other to tell what is hidden, and wholly in front of the eye."""
         offset = index.center[cut.nodes] - np.array(camera.eye)
         gap = np.sqrt(np.einsum("ij,ij->i", offset, offset)) - index.radius[cut.nodes]
-        return np.asarray(index.spacing[cut.nodes] * camera.focal < PROBE * gap)
+        return np.asarray(index.density.coarseness[cut.nodes] * camera.focal < PROBE * gap)
 
     def _judge(self, drawn: int, tested: int, hidden: int) -> None:
         """Pause where the tests hide too little."""

@@ -153,9 +153,13 @@ async def _settle(
     def coarser(layer: AccessLayer, factor: float, hidden: NDArray[np.bool_] | None) -> Cut:
         return cut_of(layer, replace(options, tolerance=options.tolerance * factor), hidden)
 
+    looking = options.style
+    if looking.splat == "blended":
+        looking = replace(looking, splat="disc")  # which shows the same nodes, sooner
+
     def draw(cut: Cut) -> tuple[Camera, Frame]:
         camera = camera_of(layer, options)
-        return camera, backend.draw(cut, layer.take, camera, options.style)
+        return camera, backend.draw(cut, layer.take, camera, looking)
 
     return await unveil(layer, coarser, wait, draw)
 

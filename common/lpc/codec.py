@@ -162,7 +162,8 @@ def encode_cloud(
         Normals predicted by planes take about 0.7 bits a sample less, but such a cloud takes twice as long to decode
         and four times as long to encode. "best" tries planes on every cloud and lets zstd search longer. "default"
         tries them where position and normal take more than 20.5 bits a sample, and keeps them where they save 0.25.
-        "fast" never tries them, looks at fewer neighbours and lets zstd search less (docs/format.md, Choices of a writer).
+        "fast" never tries them, looks at fewer neighbours and lets zstd search less (docs/format.md, Choices of a
+        writer).
 
     Returns
     -------

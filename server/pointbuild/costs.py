@@ -68,7 +68,7 @@ def bits_of(
     digits : int
         Decimals of the parts; position and total have more.
     """
-    scale = 8 * cloud_bytes / header.samples / parts.sum()
+    scale = 8 * cloud_bytes / header.samples / float(parts.sum())
     costs = zip(header.attributes, parts[1:].tolist(), strict=True)
     attributes = {attribute.name: round(part * scale, digits) for attribute, part in costs}
     index = round(8 * (header.bytes - cloud_bytes) / header.samples, digits)

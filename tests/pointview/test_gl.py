@@ -6,11 +6,15 @@ equal to 2 of 255 levels. Which of two samples at equal depth is seen may differ
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
-from support import models
+from support import models, shells
 
 from lpc.errors import Unavailable
+from pointbuild import BuildOptions, build_model
+from pointbuild.arrays import ArrayScan
 from pointview.camera import Camera
 from pointview.refine import refine
 from pointview.render import Style, open_backend
@@ -33,12 +37,20 @@ def gl():
     return GlBackend
 
 
-@pytest.fixture(scope="module", params=["normals", "normals and colours", "colours", "nothing", "survey coordinates"])
-def scene(request):
+SCENES = ["normals", "normals and colours", "colours", "nothing", "survey coordinates", "uneven"]
+
+
+@pytest.fixture(scope="module", params=SCENES)
+def scene(request, tmp_path_factory):
     eye, target = np.array([1.0, -2.5, 2.0]), np.zeros(3)
     if request.param == "survey coordinates":
         target = np.array([512_345.0, 6_012_345.0, 123.0])
         model = models.sphere(8000, at=tuple(target), color=True)
+    elif request.param == "uneven":
+        path = tmp_path_factory.mktemp("model") / "uneven.lpc"
+        points = shells.sample(shells.TORUS, "fading", 8000, normals=False)
+        build_model([ArrayScan(points)], path, BuildOptions(threads=1, cloud_size=128), clock=time.monotonic)
+        model = models.load(path.read_bytes())
     else:
         model = models.torus(8000, normals="normals" in request.param, color="colours" in request.param)
     camera = Camera(eye=tuple(target + eye), target=tuple(target), up=(0, 0, 1), width=161, height=120)

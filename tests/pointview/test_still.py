@@ -75,6 +75,8 @@ def test_kinds_of_splats_and_samples_a_pixel(model_file, tmp_path):
         pictures.append(np.asarray(Image.open(out)))
     assert all(picture.shape == (60, 80, 3) for picture in pictures)
     assert len({picture.tobytes() for picture in pictures}) == len(pictures)
+    assert run(model_file, tmp_path / "a.png", "--size", "80x60", "--tolerance", "3").exit_code == 0
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "a.png")), pictures[3])
     refused = run(model_file, tmp_path / "a.png", "--size", "9000x10", "--antialias", "2")
     assert refused.exit_code == 2
     assert "above 16384 pixels" in refused.output

@@ -65,7 +65,7 @@ STARVED = 1 << 30
 """Added to the row of a node that is starved everywhere."""
 
 PLACES_WIDTH = 1024
-"""Texels in a row of the texture of places: first one for each level, then one for each drawn node."""
+"""Texels in a row of the texture of places: first one for each level, then one for each of its rows."""
 
 
 class GlBackend:
@@ -233,15 +233,15 @@ class GlBackend:
         """Give the vertex shader the places of a cut: halvings (axis, half), then nodes (links, spacings)."""
         if cut.places is None:
             return
-        levels = len(cut.places.axis)
-        rows = -(-(levels + len(cut.nodes)) // PLACES_WIDTH)
+        levels, count = len(cut.places.axis), len(cut.places.link)
+        rows = -(-(levels + count) // PLACES_WIDTH)
         if self._places.height < rows:
             self._places.release()
             self._places = self._context.texture((PLACES_WIDTH, 1 << (rows - 1).bit_length()), 4, dtype="f4")
         texels = np.zeros((rows * PLACES_WIDTH, 4), dtype="<f4")
         texels[:levels, 0], texels[:levels, 1] = cut.places.axis, cut.places.half
-        texels[levels : levels + len(cut.nodes), :2] = cut.places.link
-        texels[levels : levels + len(cut.nodes), 2:] = cut.places.spacing
+        texels[levels : levels + count, :2] = cut.places.link
+        texels[levels : levels + count, 2:] = cut.places.spacing
         self._places.write(texels, viewport=(0, 0, PLACES_WIDTH, rows))
         self._places.use(PLACES_UNIT)
 

@@ -16,7 +16,6 @@ import numba
 import numpy as np
 
 from .rules import EMPTY, F, direction, plane_of, spacing_at, x_of, y_of, z_of
-from .tables import HALVING, PLACE  # noqa: F401  (`seen` looks for them here)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import kernels, picture_kernels
+from . import picture_kernels
+from .tables import HALVING, PLACE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -18,11 +19,11 @@ if TYPE_CHECKING:
 def place_table(cut: Cut) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return a cut's places as the kernels read them: of the nodes, and the halvings of the levels."""
     if cut.places is None:
-        return np.empty(0, dtype=kernels.PLACE), np.empty(0, dtype=kernels.HALVING)
-    places = np.empty(len(cut.nodes), dtype=kernels.PLACE)
+        return np.empty(0, dtype=PLACE), np.empty(0, dtype=HALVING)
+    places = np.empty(len(cut.places.link), dtype=PLACE)
     places["lower"], places["upper"] = cut.places.link.T
     places["lower_spacing"], places["upper_spacing"] = cut.places.spacing.T
-    halvings = np.empty(len(cut.places.axis), dtype=kernels.HALVING)
+    halvings = np.empty(len(cut.places.axis), dtype=HALVING)
     halvings["axis"], halvings["half"] = cut.places.axis, cut.places.half
     return places, halvings
 
@@ -38,11 +39,11 @@ def pixels_by_cell(depth: NDArray[np.float32], cut: Cut, camera: Camera, *, stri
         Count every so many pixels of every so many lines.
     """
     places, halvings = place_table(cut)
-    counts = np.zeros((len(cut.nodes), 2), dtype=np.int64)
+    counts = np.zeros((max(len(places), len(cut.nodes)), 2), dtype=np.int64)
     if cut.places is not None and len(places):
         eye = (np.array(camera.eye) - cut.places.corner[0]).astype(np.float32)
         looked = np.ascontiguousarray(depth[::stride, ::stride])
         picture_kernels.count_cells(
             counts, looked, places, halvings, eye, camera.rotation().astype(np.float32), camera.focal / stride
         )
-    return counts
+    return counts[: len(cut.nodes)]

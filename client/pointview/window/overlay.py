@@ -59,7 +59,8 @@ class Overlay:
     def show(self, viewer: Viewer) -> None:
         """Draw everything."""
         if viewer.mirror.index is None:
-            self._notice(viewer.message or ("opening ..." if viewer.feed is not None else WELCOME))
+            text = viewer.message or ("opening ..." if viewer.feed is not None else WELCOME)
+            (self._message if viewer.settings.help else self._notice)(text)
             return
         if viewer.frame is None:
             self._notice(PREPARING)
@@ -75,9 +76,9 @@ class Overlay:
             self._legend(colouring.legend, unit_of(crs) if colouring.mode == "height" else "")
         if viewer.recorder is not None:
             self._recording(viewer.recorder.seconds)
-        if viewer.message:
-            self._message(viewer.message)
-        if viewer.loaded[0] < viewer.loaded[1]:
+        if viewer.message or viewer.trouble:
+            self._message(viewer.message or viewer.trouble)
+        if viewer.loading:
             self._load_bar(*viewer.loaded)
 
     def _axes(self, view: Viewpoint) -> None:

@@ -10,6 +10,7 @@ from imgui_bundle import imgui
 from imgui_bundle.python_backends.glfw_backend import GlfwRenderer
 
 from lpc.errors import Unavailable
+from pointview.render import Style
 
 from .inputs import Inputs
 from .keyboard import Keyboard
@@ -187,10 +188,15 @@ class Screen:
         """Replace the picture."""
         size = (rgb.shape[1], rgb.shape[0])
         if self._texture is None or self._texture.size != size:
-            if self._texture is not None:
-                self._texture.release()
+            self.blank()
             self._texture = self._context.texture(size, 3, alignment=1)
         self._texture.write(rgb)
+
+    def blank(self) -> None:
+        """Take the picture away."""
+        if self._texture is not None:
+            self._texture.release()
+            self._texture = None
 
     def end(self) -> None:
         """Put picture and panel on the screen."""
@@ -199,7 +205,8 @@ class Screen:
         target.use()
         self._context.viewport = (*self._corner, *self._size)
         self._context.disable(moderngl.BLEND | moderngl.DEPTH_TEST | moderngl.CULL_FACE)
-        target.clear()
+        red, green, blue = (channel / 255 for channel in Style().background)
+        target.clear(red, green, blue)
         if self._texture is not None:
             self._texture.use(0)
             self._blit.render(moderngl.TRIANGLES, vertices=3)

@@ -16,6 +16,7 @@ from pointview.camera import Camera
 from pointview.occlusion import KEPT
 from pointview.refine import refine
 from pointview.render import open_backend
+from pointview.window.commands import tidied
 from pointview.window.inputs import Inputs
 from pointview.window.mirror import Came, Failed, Opened
 from pointview.window.painter import Painter
@@ -229,3 +230,19 @@ def test_the_window_lives_while_the_renderer_gets_ready(session, monkeypatch):
     compiled.set()
     one.rest()
     assert one.viewer.frame.splats > 0
+
+
+@pytest.mark.parametrize(
+    ("given", "target"),
+    [
+        ("/data/a b.lpc", "/data/a b.lpc"),
+        (" 'C:\\scans\\a.lpc'\n", "C:\\scans\\a.lpc"),
+        ('"/data/a.lpc"', "/data/a.lpc"),
+        ("file:///data/a%20b.lpc\r\nfile:///data/c.lpc", "/data/a b.lpc"),
+        ("file://localhost/data/a.lpc", "/data/a.lpc"),
+        ("https://host/a%20b.lpc?token=x", "https://host/a%20b.lpc?token=x"),
+        ("", ""),
+    ],
+)
+def test_what_was_dropped_or_pasted(given, target):
+    assert tidied(given) == target

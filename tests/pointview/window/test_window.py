@@ -140,10 +140,12 @@ def test_no_frame_waits_for_the_network(screen, model_file):
 
 
 def test_an_unreachable_model_is_a_message_not_a_wait(screen, tmp_path):
-    with viewing(screen, tmp_path / "none.lpc", "--seconds", 1.5, "--size", "300x200") as process:
+    noise = tmp_path / "noise.lpc"
+    noise.write_bytes(bytes(range(256)) * 300)
+    with viewing(screen, noise, "--seconds", 1.5, "--size", "300x200") as process:
         _, problem = process.communicate(timeout=60)
     assert process.returncode == 1
-    assert "none.lpc" in problem
+    assert "noise.lpc" in problem
 
 
 def test_without_a_display_it_says_so(model_file):
@@ -151,4 +153,12 @@ def test_without_a_display_it_says_so(model_file):
         _, problem = process.communicate(timeout=60)
     assert process.returncode == 1
     assert "no window can be opened here" in problem
+    assert problem.count("\n") == 1
+
+
+def test_a_missing_file_is_said_before_a_missing_display(tmp_path):
+    with viewing("", tmp_path / "none.lpc") as process:
+        _, problem = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert problem.endswith("none.lpc: there is no such file\n")
     assert problem.count("\n") == 1
