@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lpc.codec import cloud_to_points, decode_cloud
+from lpc.codec import decode_cloud, samples_to_points
 from lpc.errors import BuildError, FormatError
 from lpc.header import HEADER_PROBE, parse_header
 from lpc.index import IndexTree
@@ -143,12 +143,15 @@ class OldModel:
 
     def _decode(self, first: int, stop: int) -> PointBatch:
         """Give the samples of nodes `first` to `stop - 1`."""
-        header, parts = self.header, []
+        header, clouds = self.header, []
         with self.path.open("rb") as file, _told(self.path):
             for node in range(first, stop):
                 frame, samples = self.frame(file.fileno(), node), int(self.index.samples[node])
-                parts.append(cloud_to_points(decode_cloud(frame, samples=samples, schema=header.attributes), header))
-        points = PointBatch.concatenate(parts)
+                clouds.append(decode_cloud(frame, samples=samples, schema=header.attributes))
+        codes = {
+            entry.name: np.concatenate([cloud.codes[entry.name] for cloud in clouds]) for entry in header.attributes
+        }
+        points = samples_to_points(np.concatenate([cloud.lattice() for cloud in clouds]), codes, header)
         xyz = np.clip(points.xyz, header.bounds[:3], header.bounds[3:])
         owner = np.repeat(np.arange(first, stop, dtype=np.uint32) + np.uint32(1), self.index.samples[first:stop])
         return PointBatch(xyz, {**points.attributes, OWNER: owner})
