@@ -11,6 +11,7 @@ from numba import njit
 from lpc.octahedral_compiled import unit_vectors
 
 from .areas import Probing, measure
+from .priority import defer_copies
 from .rows import as_words, positions
 from .spool import write_all
 from .tree import Tree, grow
@@ -139,6 +140,7 @@ def partition(
     xyz = positions(rows)
     fixed = cells.fixed(xyz)
     priority = np.ascontiguousarray(rows["priority"])
+    defer_copies(fixed, priority)
     areas = measure(cells, probing, fixed, xyz, priority, bucket.depth)
     del xyz
     taken, floor = _smallest(priority, sum(shares))

@@ -250,6 +250,7 @@ def _sizes(inputs: Inputs, out: Path, folder: Folder, options: BuildOptions, *, 
     """Check the disk, and share out the memory."""
     spool_bytes = sum(column.itemsize for column in columns_of(inputs.attributes, options.precision, owned=owned))
     attribute_bytes = spool_bytes - 24  # codes are never wider than values
+    attribute_bytes += 4 if owned else 0  # of a row: the old cloud has a word of its own
     samples = inputs.samples_at_most
     row_bytes = whole_words(row_start(short=False) + attribute_bytes)
     sizes = memory.choose_sizes(options, samples, row_bytes, memory.resident_bytes())

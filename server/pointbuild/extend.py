@@ -131,6 +131,7 @@ class OldModel:
         A decoded position may lie half a step outside the box of the input; it is given on the box, which is nearest to
         the same lattice point.
         """
+        size = max(size // (DECODERS + 2), 1)  # so many runs are here at a time
         samples = np.cumsum(self.index.samples)
         cuts = [0]
         while cuts[-1] < len(samples):

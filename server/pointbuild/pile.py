@@ -7,6 +7,7 @@ samples have equal priorities, and there may be more of them than fit: these are
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ from lpc.page import COINCIDENT
 
 from .areas import Probing, pile_spacing
 from .bucket import BucketTree, Clouds, summarise
+from .priority import COPY
 from .rows import positions
 from .spool import read_all, write_all
 from .tree import TOO_MANY, Tree
@@ -108,7 +110,7 @@ def partition_pile(
 
 
 def _sort_by_priority(first_row: int, count: int, most: int, regions: Rows) -> None:
-    """Sort the rows, about `most` at a time."""
+    """Sort the rows, about `most` at a time, and let copies come last."""
     shift = np.uint64(64 - SLICE_BITS)
     histogram = np.zeros(1 << SLICE_BITS, np.int64)
     for rows in regions.chunks(first_row, count, CHUNK):
@@ -126,16 +128,18 @@ def _sort_by_priority(first_row: int, count: int, most: int, regions: Rows) -> N
                 yield each, rows[number == each]
 
     with regions.rewriting(first_row) as file:
-        filled = starts.copy()
+        filled = count + starts  # behind the place of the rows, which copies are still among
         for each, part in parts(~heavy):
             write_all(file, part, int(filled[each]) * size)
             filled[each] += len(part)
-        for start, length in zip(starts[~heavy].tolist(), sizes[~heavy].tolist(), strict=True):
+        for start, length in zip((count + starts[~heavy]).tolist(), sizes[~heavy].tolist(), strict=True):
             rows = np.empty(length, regions.dtype)
             read_all(file, rows, start * size)
             write_all(file, rows[np.argsort(rows["priority"])], start * size)
         for each in np.flatnonzero(heavy).tolist():
-            _place_equals(partial(parts, np.arange(len(heavy)) == each), int(starts[each]), file, size)
+            _place_equals(partial(parts, np.arange(len(heavy)) == each), count + int(starts[each]), file, size)
+        _split_copies(count, file, regions.dtype)
+        os.truncate(file, count * size)
 
 
 def _place_equals(parts: Callable[[], Iterator[tuple[int, NDArray[Any]]]], start: int, file: int, size: int) -> None:
@@ -154,6 +158,27 @@ def _place_equals(parts: Callable[[], Iterator[tuple[int, NDArray[Any]]]], start
         for value, run in zip(values.tolist(), np.split(ordered, first[1:]), strict=True):
             write_all(file, run, place[value] * size)
             place[value] += len(run)
+
+
+def _split_copies(count: int, file: int, dtype: np.dtype[Any]) -> None:
+    """Move `count` sorted rows from row `count` on to the start, first those that are no copies."""
+
+    def parts() -> Iterator[tuple[NDArray[Any], NDArray[np.bool_]]]:
+        last = COPY  # no row has it
+        for at in range(count, 2 * count, CHUNK):
+            rows = np.empty(min(CHUNK, 2 * count - at), dtype)
+            read_all(file, rows, at * dtype.itemsize)
+            priority = rows["priority"]
+            yield rows, priority == np.append(last, priority[:-1])
+            last = priority[-1]
+
+    places = [0, sum(int((~copy).sum()) for _, copy in parts())]
+    for rows, copy in parts():
+        for kind, which in enumerate((~copy, copy)):
+            chosen = rows[which]
+            chosen["priority"] |= COPY * np.uint64(kind)
+            write_all(file, chosen, places[kind] * dtype.itemsize)
+            places[kind] += len(chosen)
 
 
 def _chain(bucket: Bucket, left: int, cloud_size: int, cells: Cells, fixed: NDArray[np.uint64]) -> Tree:

@@ -194,7 +194,9 @@ def _select(priority: Any, take: Any, floor: Any, scratch: Any) -> Any:
     None is below `floor`, most are uniform, so few are looked at twice.
     """
     share = (take + 6.0 * np.sqrt(take) + 16.0) / len(priority)
-    room = 18446744073709551616.0 - float(floor)
+    room = 9223372036854775808.0 - float(floor)  # of samples that are no copies
+    if room <= 0.0:
+        room += 9223372036854775808.0
     while True:
         reach = float(floor) + share * room
         limit = np.uint64(18446744073709551615)

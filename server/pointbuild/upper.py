@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .priority import COPY
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -73,8 +75,9 @@ class Upper:
 def candidate_limits(plan: Plan, cloud_size: int, slack: float) -> NDArray[np.uint64]:
     """Priorities up to which the samples of each bucket may be taken by the upper tree.
 
-    The expected threshold of a node is T / C of the range, with C the samples of its cell and T those drawn there
-    by LPC equation 1; `slack` is how many standard deviations of T are added.
+    The expected threshold of a node is T / C of the range of samples that are no copies, with C the samples of its cell
+    and T those drawn there by LPC equation 1; `slack` is how many standard deviations of T are added, and how many
+    32nds of T because others are copies.
     """
     limits = np.zeros(len(plan.buckets), np.uint64)
 
@@ -83,8 +86,8 @@ def candidate_limits(plan: Plan, cloud_size: int, slack: float) -> NDArray[np.ui
             limits[cell.buckets[0]] = most
             return
         drawn += cloud_size
-        enough = drawn + slack * math.sqrt(drawn) + 4 * slack
-        most = max(most, min(int(enough / cell.count * 2.0**64), int(ALL)))
+        enough = drawn * (1 + slack / 32) + slack * math.sqrt(drawn) + 4 * slack
+        most = max(most, min(int(enough / cell.count * 2.0**63), int(ALL)))
         for child in cell.children:
             if child is not None:
                 visit(child, drawn * child.count / cell.count, most)
@@ -112,6 +115,10 @@ def share_out(plan: Plan, candidates: Candidates, limits: NDArray[np.uint64], cl
     """
     order = np.lexsort((candidates.priority, candidates.bucket))
     priority, bucket = candidates.priority[order], candidates.bucket[order]
+    copy = 1 + np.flatnonzero((priority[1:] == priority[:-1]) & (bucket[1:] == bucket[:-1]))
+    priority[copy] |= COPY
+    order = np.lexsort((priority, bucket))
+    priority = priority[order]
     first = np.searchsorted(bucket, np.arange(len(plan.buckets) + 1))
     count = np.array([entry.count for entry in plan.buckets])
     used = np.zeros(len(plan.buckets), np.int64)  # candidates of each bucket that are taken, in order of priority

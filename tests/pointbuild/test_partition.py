@@ -15,6 +15,7 @@ from oracles.partition import partition
 from support.built import Built, build_points, numbered
 
 from lpc.lattice import quantise
+from lpc.points import PointBatch
 from pointbuild.priority import priorities
 from pointbuild.rows import fill_rows, row_dtype
 
@@ -141,6 +142,18 @@ def test_priorities_do_not_depend_on_where_a_sample_stands() -> None:
 
 
 def test_samples_next_to_each_other_have_unrelated_priorities() -> None:
-    whole = priorities(words(100_000), 5) >> np.uint64(54)
+    whole = priorities(words(100_000), 5) >> np.uint64(53)
     counts = np.bincount(whole.astype(int), minlength=1024)
     assert ((counts - counts.mean()) ** 2 / counts.mean()).sum() < 1024 + 6 * np.sqrt(2 * 1024)  # chi squared
+
+
+@pytest.mark.parametrize("bucket", [256, 100_000])
+def test_copies_of_a_sample_come_after_everything_else(bucket: int, tmp_path: Path) -> None:
+    """On a coarse lattice many samples without attributes are equal: no cloud shows a place again before all are shown."""
+    xyz = surfaces.bumpy(6000, seed=8).xyz
+    built = build_points(PointBatch(xyz), tmp_path / "m.lpc", cloud_size=32, bucket_samples=bucket, position_error=0.04)
+    different = len(np.unique(quantise(xyz, np.array(built.header.origin), built.header.step), axis=0))
+    assert different < 0.7 * len(xyz)
+    for level in range(4):
+        shown = np.concatenate([built.clouds[node].xyz for node in np.flatnonzero(built.index.level <= level)])
+        assert len(np.unique(shown, axis=0)) == len(shown), level
