@@ -149,7 +149,7 @@ def test_samples_next_to_each_other_have_unrelated_priorities() -> None:
 
 @pytest.mark.parametrize("bucket", [256, 100_000])
 def test_copies_of_a_sample_come_after_everything_else(bucket: int, tmp_path: Path) -> None:
-    """On a coarse lattice many samples without attributes are equal: no cloud shows a place again before all are shown."""
+    """On a coarse lattice many samples without attributes are equal; a place is shown again when all places are."""
     xyz = surfaces.bumpy(6000, seed=8).xyz
     built = build_points(PointBatch(xyz), tmp_path / "m.lpc", cloud_size=32, bucket_samples=bucket, position_error=0.04)
     different = len(np.unique(quantise(xyz, np.array(built.header.origin), built.header.step), axis=0))

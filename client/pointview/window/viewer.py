@@ -104,12 +104,13 @@ class Viewer:
         self._drawn: tuple[object, ...] = ()
         self._moved_at = self._share_at = self._turned_at = self._told_at = -1e9
         self._redraw = False
+        self._errors: dict[str, int] = {}
 
     def open(self, target: str) -> None:
         """Show another model in place of the present one."""
         self._close_feed()
         self.mirror, self.view, self.cut, self.frame, self.scene = Mirror(), None, None, None, None
-        self.message, self.loaded = "", (0, 0)
+        self.message, self.loaded, self._errors = "", (0, 0), {}
         self.settings.up, self.settings.help = None, False
         self.feed = self._open_feed(target)
 
@@ -144,12 +145,6 @@ class Viewer:
         return recorder
 
     @property
-    def trouble(self) -> str:
-        """What keeps data from coming, in a line; empty if nothing does."""
-        stats = None if self.feed is None else self.feed.stats
-        return stats.errors[0].text if stats is not None and stats.errors else ""
-
-    @property
     def loading(self) -> bool:
         """Whether more of the view is to come."""
         return self.feed is not None and self.feed.wanting and self.loaded[0] < self.loaded[1]
@@ -176,6 +171,7 @@ class Viewer:
         news = self.mirror.take_in(self.feed.news())
         if self.mirror.failure:
             self.message = self.mirror.failure
+        self._hear(self.feed)
         if self.mirror.index is None:
             return None
         self._place(did, now)
@@ -194,6 +190,15 @@ class Viewer:
             self._share_at = now
             self.loaded = loaded_bytes(self.mirror, self.view.camera, self.settings, self.culling.hidden)
         return picture
+
+    def _hear(self, feed: Feed) -> None:
+        """Show what keeps data from coming, each time that it happens."""
+        errors = () if feed.stats is None else feed.stats.errors
+        counts = {error.text: error.count for error in errors}
+        new = [text for text, count in counts.items() if count > self._errors.get(text, 0)]
+        if new:
+            self.tell(new[-1])
+        self._errors = counts
 
     def _draw(self, *, moving: bool) -> NDArray[np.uint8] | None:
         assert self.view is not None
