@@ -192,7 +192,8 @@ def _build(
     ):
         progress.stage("read", spool.samples or inputs.samples_hint)
         if recalled is None:
-            found = survey(inputs.batches(sizes.block), spool, crew, progress, options.precision)
+            sketched = options.position_error is None and options.step is None
+            found = survey(inputs.batches(sizes.block), spool, crew, progress, options.precision, sketched=sketched)
             if old:
                 found = old.join_survey(found)
             told = {"inputs": inputs.to_json(), "sizes": asdict(sizes), "found": found.to_json()}

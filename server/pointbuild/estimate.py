@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 WHOLE = 1 << 16
 """Samples of a model that is measured whole."""
 
-SEEDS = 1 << 14
+SEEDS = 1 << 13
 """Random samples, about, that say where samples are before they are counted."""
 
 QUERIES = 512

@@ -114,7 +114,15 @@ def columns_of(attributes: dict[str, np.dtype[Any]], precision: Precision, *, ow
     return (*columns, Column(OWNER, np.dtype("<u4"))) if owned else tuple(columns)
 
 
-def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Progress, precision: Precision) -> Survey:
+def survey(
+    batches: Iterable[PointBatch],
+    spool: Spool,
+    crew: Crew,
+    progress: Progress,
+    precision: Precision,
+    *,
+    sketched: bool = True,
+) -> Survey:
     """Fill the spool.
 
     Parameters
@@ -127,6 +135,8 @@ def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Pr
         Prepares batches while the next one is read.
     progress : Progress
     precision : Precision
+    sketched : bool
+        Random samples are wanted.
 
     Raises
     ------
@@ -137,7 +147,7 @@ def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Pr
     sketch = Sketch()
     rejected: dict[str, int] = {}
     ranges = {column.name: _Range(column) for column in spool.columns[1:] if column.name != OWNER}
-    prepare = partial(_prepare, normal_bits=precision.normal_bits)
+    prepare = partial(_prepare, normal_bits=precision.normal_bits, sketched=sketched)
 
     def looked_at() -> Iterator[tuple[Block, dict[str, NDArray[Any]], int]]:
         for batch, (values, low, high, drawn, dropped) in crew.map(prepare, batches):
@@ -168,7 +178,7 @@ def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Pr
 
 
 def _prepare(
-    batch: PointBatch, normal_bits: int
+    batch: PointBatch, normal_bits: int, sketched: bool
 ) -> tuple[dict[str, NDArray[Any]], NDArray[Any], NDArray[Any], Sketch, dict[str, int]]:
     """Give the samples of a batch as columns, their box, some of them, and what was dropped."""
     dropped: dict[str, int] = {}
@@ -180,7 +190,7 @@ def _prepare(
     values: dict[str, NDArray[Any]] = {"xyz": batch.xyz}
     for name, column in batch.attributes.items():
         values[name] = encode_normals(column, normal_bits) if name == "normal" else column
-    return values, box[0], box[1], Sketch.of(batch.xyz), dropped
+    return values, box[0], box[1], Sketch.of(batch.xyz) if sketched else Sketch(), dropped
 
 
 @njit(cache=True, nogil=True)
