@@ -38,7 +38,7 @@ PART = 4
 """Of a region, whose spacing is measured: more places for the same memory."""
 
 _WINDOW = 63
-_COARSE = 15  # path bits that tell most samples to be in no cell
+_COARSE = 20  # path bits that tell most samples to be in no cell
 _ROW = np.dtype([("priority", "<u8"), ("xyz", "<f8", (3,))])
 
 
@@ -173,17 +173,13 @@ class Catch:
 
     def __init__(self, cells: Cells, key: NDArray[np.uint64], depth: NDArray[np.int64], most: int) -> None:
         self.window, self.most = cells.window(0, _WINDOW), most
-        window, coarse = self.window, cells.window(0, _COARSE)
-        self._cells, self._coarse = cells, coarse
+        self._cells, self._coarse = cells, cells.window(0, _COARSE)
         self._key, self._depth = key, depth.copy()
         self._low, self._high = np.empty_like(key), np.empty_like(key)
         self._held: list[list[tuple[NDArray[np.float64], NDArray[np.uint64]]]] = [[] for _ in key]
         for number in range(len(key)):
             self._bound(number)
-        shift = np.uint64(window.bits - coarse.bits)
-        self._table = np.zeros(1 << coarse.bits, np.bool_)
-        for low, high in zip(self._low >> shift, self._high >> shift, strict=True):
-            self._table[int(low) : int(high) + 1] = True
+        self._table = self._marked()
 
     @classmethod
     def around(cls, sketch: Sketch, cells: Cells, samples: int, most: int) -> Catch:
@@ -218,6 +214,7 @@ class Catch:
             part = order[ends[number] : ends[number + 1]]
             self._held[number].append((xyz[part], keys[part]))
             self._halve(number)
+        self._table = self._marked()
 
     def spacing(self, probing: Probing) -> NDArray[np.float64]:
         """Spacings of the cells, where their samples are enough to measure it."""
@@ -228,6 +225,14 @@ class Catch:
         faces = self._cells.faces(self._cells.fixed(xyz[low]), self._depth[counts >= FEWEST])
         found = probe(xyz, _hashes(xyz), low, low + counts[counts >= FEWEST], faces, probing)
         return found[found > 0]
+
+    def _marked(self) -> NDArray[np.bool_]:
+        """First bits of all paths that may be in a cell."""
+        shift = np.uint64(self.window.bits - self._coarse.bits)
+        table = np.zeros(1 << self._coarse.bits, np.bool_)
+        for low, high in zip((self._low >> shift).tolist(), (self._high >> shift).tolist(), strict=True):
+            table[low : high + 1] = True
+        return table
 
     def _halve(self, number: int) -> None:
         held = self._held[number]
