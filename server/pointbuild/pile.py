@@ -175,8 +175,7 @@ def _split_copies(count: int, file: int, dtype: np.dtype[Any]) -> None:
     places = [0, sum(int((~copy).sum()) for _, copy in parts())]
     for rows, copy in parts():
         for kind, which in enumerate((~copy, copy)):
-            chosen = rows[which]
-            chosen["priority"] |= COPY * np.uint64(kind)
+            chosen = rows[which]  # as they are: a build that was killed may sort them again
             write_all(file, chosen, places[kind] * dtype.itemsize)
             places[kind] += len(chosen)
 
