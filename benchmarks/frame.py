@@ -73,16 +73,19 @@ def _gl(model: models.Model, cuts: list[Any], one_draw: bool) -> tuple[float, fl
 
         def submit(turn: int) -> None:
             cut, camera = cuts[turn]
-            backend._begin_splats(cut, camera, STYLE)  # noqa: SLF001
             backend._write_places(cut)  # noqa: SLF001
-            backend._submit(cut, slice(0, len(cut.nodes)), camera)  # noqa: SLF001
+            samples.tell(backend._told(cut, camera, STYLE))  # noqa: SLF001
+            backend._submit(samples, cut, slice(0, len(cut.nodes)), camera)  # noqa: SLF001
 
         def draw(_turn: int) -> None:
-            backend._points.render_indirect(backend._commands, moderngl.POINTS, clouds)  # noqa: SLF001
+            samples.points.render_indirect(backend._commands, moderngl.POINTS, clouds)  # noqa: SLF001
 
+        samples = backend._splats  # noqa: SLF001
         finish, clouds = backend._context.finish, len(cuts[-1][0].nodes)  # noqa: SLF001
-        submission = _median(submit, after=finish)
-        return _median(cache), submission, _median(draw, after=finish) if one_draw else 0.0
+        with backend._context:  # noqa: SLF001
+            backend._splatted.target.use()  # noqa: SLF001
+            submission = _median(submit, after=finish)
+            return _median(cache), submission, _median(draw, after=finish) if one_draw else 0.0
     finally:
         backend.close()
 

@@ -94,6 +94,7 @@ class Screen:
         io.fonts.add_font_default_vector()
         style.font_size_base = LETTERS
         style.frame_rounding = style.grab_rounding = 3.0
+        style.set_color_(imgui.Col_.popup_bg, (0.1, 0.1, 0.1, 1.0))
         style.set_color_(imgui.Col_.slider_grab, (0.26, 0.59, 0.98, 0.5))  # the number behind it stays legible
         self._scale = 1.0
         self._imgui = GlfwRenderer(self._window, attach_callbacks=True)

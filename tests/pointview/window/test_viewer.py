@@ -14,10 +14,11 @@ from support.display import until
 
 from lpc.points import PointBatch
 from pointview.camera import Camera
-from pointview.occlusion import KEPT
+from pointview.occlusion import KEPT, Occlusion
 from pointview.refine import refine
 from pointview.render import open_backend
 from pointview.window.commands import tidied
+from pointview.window.culling import STRIDE
 from pointview.window.inputs import Inputs
 from pointview.window.mirror import Came, Failed, Opened
 from pointview.window.painter import Painter
@@ -160,6 +161,32 @@ def test_a_moving_camera_shows_in_the_frame_what_was_hidden(session, onion):
         _, expected = whole(onion, one)
         worst = max(worst, differing(one.viewer.frame, expected))
     assert worst < 0.005
+
+
+@pytest.mark.parametrize(("cost", "asked"), [(0.001, 12), (0.018, 6), (0.5, 4)])
+def test_tests_keep_to_their_share_of_moving_frames(session, monkeypatch, cost, asked):
+    one = session()
+    one.rest()
+    looks, look, draw = [], Occlusion.look, Painter.draw
+
+    def slow_look(*arguments, **options):
+        looks.append(options["stride"])
+        one.now += cost
+        return look(*arguments, **options) and 0  # no third pass
+
+    def slow_draw(*arguments):
+        one.now += 0.1
+        return draw(*arguments)
+
+    monkeypatch.setattr(Occlusion, "look", slow_look)
+    monkeypatch.setattr(Painter, "draw", slow_draw)
+    one.frame(turned=(2.0, 0.0))
+    looks.clear()
+    for _ in range(12):
+        one.frame(turned=(2.0, 0.0))
+    assert looks == [STRIDE] * asked
+    one.rest()
+    assert looks[-1] == 1
 
 
 def test_the_budget_counts_what_is_seen(session, onion):
