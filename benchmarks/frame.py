@@ -3,8 +3,8 @@
 The clouds have 12 samples each and the picture is small, so what is measured is the work per cloud: traversal, memory
 management and submission, and not the splats. OpenGL is measured until all commands are submitted, with the indirect
 multi-draw of 4.3 and with the loop of draws that 3.3 needs; a driver in software does the work of the vertices inside
-these calls, so what the one call of the multi-draw takes is shown apart. Times are medians over frames of a turning
-camera, of the calling thread's CPU.
+these calls, so what the one call of the multi-draw takes is shown apart; of the loop it is part of the figure. Times
+are medians over frames of a turning camera, of the calling thread's CPU.
 """
 
 from __future__ import annotations

@@ -3,7 +3,9 @@
 Random samples of a sphere that fills 80% of a 1024x1024 picture, in clouds of 8,192 that are sorted inside, all in the
 backend's memory; with back faces drawn, and dropped. Splats are submitted splats.
 
-    frame    from the cut to the picture as an array; "CPU" divides by the CPU time of all threads
+    frame    from the cut to the picture as an array: by the wall clock; by the CPU time of all threads; and by that of
+             the calling thread, which has its share of the samples and all that is not shared: what the wall clock says
+             where nothing else runs
     splats   of OpenGL, on a GPU or in software: from an idle pipeline until `glFinish` returns, without reading back;
              "timer" is what OpenGL's own timer query says of the same commands
 
@@ -131,16 +133,16 @@ class Stopwatch:
         return wall, timer
 
 
-def milliseconds(draw: Callable[[], Any]) -> tuple[float, float]:
-    """Median wall and CPU time of a call, after one to warm up."""
+def milliseconds(draw: Callable[[], Any]) -> list[float]:
+    """Median times of a call, after one to warm up: wall, CPU of all threads, CPU of this one."""
     draw()
-    wall, cpu = [], []
+    clocks = (time.perf_counter, time.process_time, time.thread_time)
+    taken = []
     for _ in range(ROUNDS):
-        start, start_cpu = time.perf_counter(), time.process_time()
+        before = [clock() for clock in clocks]
         draw()
-        wall.append(time.perf_counter() - start)
-        cpu.append(time.process_time() - start_cpu)
-    return 1e3 * float(np.median(wall)), 1e3 * float(np.median(cpu))
+        taken.append([clock() - start for clock, start in zip(clocks, before, strict=True)])
+    return [1e3 * float(median) for median in np.median(taken, axis=0)]
 
 
 def main() -> None:
@@ -155,13 +157,15 @@ def main() -> None:
         backend = open_backend(options.backend, header, threads=threads)
         watch = Stopwatch(backend) if options.backend == "gl" else None
         print(f"{backend.name}, {threads} thread{'s' if threads > 1 else ''}, {samples:,} samples")
-        print(f"{'px':>4} {'back faces':>10} {'frame ms':>9} {'M/s':>7} {'M/s CPU':>7}"
+        print(f"{'px':>4} {'back faces':>10} {'frame ms':>9} {'M/s':>7} {'CPU M/s':>7} {'own M/s':>7}"
               + (f" {'splats ms':>9} {'M/s':>7} {'timer ms':>8} {'M/s':>7}" if watch else ""))  # fmt: skip
         for side in (0.5, 3.0, 9.0):
             cut = cut_of(header, clouds, side, camera)
             for style, name in ((Style(two_sided=True), "drawn"), (Style(), "dropped")):
-                wall, cpu = milliseconds(partial(backend.draw, cut, clouds.__getitem__, camera, style))
-                line = f"{side:4g} {name:>10} {wall:9.1f} {samples / wall / 1e3:7.1f} {samples / cpu / 1e3:7.1f}"
+                wall, cpu, own = milliseconds(partial(backend.draw, cut, clouds.__getitem__, camera, style))
+                line = f"{side:4g} {name:>10} {wall:9.1f}"
+                for taken in (wall, cpu, own):
+                    line += f" {samples / taken / 1e3:7.1f}"
                 for taken in watch.milliseconds() if watch else ():
                     line += f" {taken:9.2f} {samples / taken / 1e3:7.1f}"
                 print(line)
