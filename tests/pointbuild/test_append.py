@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -26,6 +27,7 @@ from lpc.points import PointBatch
 from pointbuild import BuildOptions, build_model
 from pointbuild.arrays import ArrayScan
 from pointbuild.cli import build
+from pointbuild.cluster import Cluster
 from pointbuild.folder import work_folder
 
 if TYPE_CHECKING:
@@ -404,3 +406,16 @@ def test_killed_at_any_moment_the_old_model_is_whole_until_the_new_one_is(
     for each in models:
         assert each.read_bytes() == new, each
         assert list(each.parent.iterdir()) == [each]
+
+
+def test_workers_of_a_cluster_encode_everything_to_the_same_bytes(tmp_path: Path) -> None:
+    model, whole = tmp_path / "m.lpc", tmp_path / "whole.lpc"
+    built([SURFACE.take(~PATCH)], model)
+    with ThreadPoolExecutor(2) as pool:
+        report = build_model(
+            [ArrayScan(SURFACE.take(PATCH))], model, BuildOptions(bucket_samples=700), clock=time.monotonic,
+            append=model, cluster=Cluster(pool, 4),
+        )  # fmt: skip
+    built([SURFACE], whole)
+    assert report.clouds_kept == 0
+    assert model.read_bytes() == whole.read_bytes()
