@@ -314,14 +314,18 @@ def cloud_to_points(cloud: Cloud, header: Header) -> PointBatch:
     PointBatch
         Every attribute of the header, constants included.
     """
-    xyz = dequantise(cloud.lattice(), np.asarray(header.origin, np.float64), header.step)
+    return samples_to_points(cloud.lattice(), cloud.codes, header)
+
+
+def samples_to_points(lattice: NDArray[np.int64], codes: Mapping[str, NDArray[Any]], header: Header) -> PointBatch:
+    """Give samples, of one or many clouds, in model units; see `cloud_to_points`."""
+    xyz = dequantise(lattice, np.asarray(header.origin, np.float64), header.step)
     values: dict[str, NDArray[Any]] = {}
     for attribute in header.attributes:
-        codes = cloud.codes[attribute.name]
         if attribute.kind == "normal":
-            values[attribute.name] = decode_normals(codes, attribute.bits)
+            values[attribute.name] = decode_normals(codes[attribute.name], attribute.bits)
         else:
-            values[attribute.name] = attribute.decode(codes)
+            values[attribute.name] = attribute.decode(codes[attribute.name])
     for name, constant in header.constants.items():
-        values[name] = constant.fill(len(cloud))
+        values[name] = constant.fill(len(lattice))
     return PointBatch(xyz, values)

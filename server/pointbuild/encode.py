@@ -16,12 +16,11 @@ from numba import njit
 
 from lpc.bounds import decode_centers, quantise_cones, quantise_spheres
 from lpc.codec import Effort, encode_clouds
-from lpc.lattice import quantise
 from lpc.octahedral import decode_normals, encode_normals
 from lpc.octahedral_compiled import unit_vectors
 from lpc.page import RECORD
 
-from .rows import positions
+from .extend import OWNER
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,6 +28,8 @@ if TYPE_CHECKING:
     from lpc.attributes import Schema
 
     from .assemble import Nodes
+    from .extend import OldClouds
+    from .frame import Frame
     from .rows import Rows
 
 
@@ -54,10 +55,12 @@ class Geometry:
     axis: NDArray[np.float32]
 
     @classmethod
-    def of(cls, nodes: Nodes, origin: NDArray[np.float64], high: NDArray[np.float64], step: float) -> Geometry:
-        """Choose centres and axes; the lattice begins at the corner `origin` of the box up to `high`."""
-        side = float((high - origin).max()) * (1 + 2.0**-20) or 1.0
-        center = nodes.box[:, :3] + (nodes.box[:, 3:] - nodes.box[:, :3]) / 2
+    def of(cls, nodes: Nodes, frame: Frame) -> Geometry:
+        """Choose centres and axes."""
+        origin, step = frame.origin, frame.step
+        top = np.maximum(frame.high, nodes.box[0, 3:] * step + origin)
+        side = float((top - origin).max()) * (1 + 2.0**-20) or 1.0
+        center = (nodes.box[:, :3] + nodes.box[:, 3:]) * (step / 2) + origin
         codes = np.clip(np.rint((center - origin) * (2.0**32 / side)), 0, 2**32 - 1).astype(np.uint32)
         length = np.sqrt((nodes.normals.astype(np.float64) ** 2).sum(axis=1))
         whole = (nodes.bare == 0) & (length > 0)
@@ -71,7 +74,7 @@ class Run:
     """Frames of consecutive nodes from `first` on, their sizes and checksums; a recalled run has no frames.
 
     `reach` and `spread` (k, levels): the largest squared distance of a cloud's samples to the centre of its ancestor
-    at each level, itself included, and of its normals to the ancestor's axis.
+    at each level, itself included, and of its normals to the ancestor's axis. `kept`: clouds of an older model.
     """
 
     first: int
@@ -80,6 +83,7 @@ class Run:
     checks: NDArray[np.uint32]
     reach: NDArray[np.float64]
     spread: NDArray[np.float64]
+    kept: int = 0
 
 
 def encode_run(
@@ -91,8 +95,9 @@ def encode_run(
     regions: Rows,
     schema: Schema,
     effort: Effort,
+    old: OldClouds | None = None,
 ) -> Run:
-    """Encode nodes `first` to `stop - 1`."""
+    """Encode nodes `first` to `stop - 1`, but for those that are clouds of an older model."""
     counts = nodes.samples[first:stop]
     bounds = np.concatenate([[0], np.cumsum(counts)])
     rows = np.empty(bounds[-1], regions.dtype)
@@ -101,9 +106,9 @@ def encode_run(
         count = int(nodes.run_count[run])
         regions.read(int(nodes.run_first[run]), rows[at : at + count])
         at += count
-    lattice = quantise(positions(rows), geometry.origin, geometry.step)
+    lattice = rows["xyz"].astype(np.int64)
     codes = {attribute.name: rows[attribute.name] for attribute in schema}
-    frames = encode_clouds(lattice, codes, bounds, schema, effort=effort)
+    frames, kept = _frames(lattice, codes, rows, bounds, schema, effort, old)
     shape = (stop - first, int(nodes.depth[first:stop].max()) + 1)
     reach, spread = np.zeros(shape), np.zeros(shape)
     _reach(lattice, bounds, first, nodes.parent, nodes.depth, geometry.origin, geometry.step, geometry.center, reach)
@@ -112,7 +117,31 @@ def encode_run(
             normals = unit_vectors(rows[attribute.name], attribute.bits)
             _spread(normals, bounds, first, nodes.parent, nodes.depth, geometry.axis, spread)
     sizes = np.array([len(frame) for frame in frames], np.uint32)
-    return Run(first, frames, sizes, np.array([zlib.crc32(frame) for frame in frames], np.uint32), reach, spread)
+    return Run(first, frames, sizes, np.array([zlib.crc32(frame) for frame in frames], np.uint32), reach, spread, kept)
+
+
+def _frames(
+    lattice: NDArray[np.int64],
+    codes: dict[str, NDArray[Any]],
+    rows: NDArray[Any],
+    bounds: NDArray[np.int64],
+    schema: Schema,
+    effort: Effort,
+    old: OldClouds | None,
+) -> tuple[list[bytes], int]:
+    """Frames of clouds, and how many of them are old."""
+    if old is None:
+        return encode_clouds(lattice, codes, bounds, schema, effort=effort), 0
+    found = old.find(rows[OWNER], bounds)
+    fresh = np.flatnonzero(found < 0)
+    changed = np.repeat(found < 0, np.diff(bounds))
+    ends = np.concatenate([[0], np.cumsum(np.diff(bounds)[fresh])])
+    written = encode_clouds(
+        lattice[changed], {name: values[changed] for name, values in codes.items()}, ends, schema, effort=effort
+    )
+    frames = dict(zip(fresh.tolist(), written, strict=True))
+    frames.update(zip(np.flatnonzero(found >= 0).tolist(), old.frames(found[found >= 0]), strict=True))
+    return [frames[cloud] for cloud in range(len(found))], len(found) - len(fresh)
 
 
 def kernels_are_loaded() -> bool:
