@@ -272,7 +272,7 @@ def _residuals(value: Any, before: Any, bits: int, start: int, number: Any) -> N
 
 @njit(cache=True, nogil=True)
 def _arrange(lattice: Any, rows: Any, begin: int, end: int) -> Any:
-    """Sort samples; returns rotation, flips, bits and low bits of a coordinate, corner, sorted codes and sample numbers."""
+    """Sort samples; returns rotation, flips, bits and low bits of coordinates, corner, codes and sample numbers."""
     k = end - begin
     corner = lattice[begin].copy()
     far = lattice[begin].copy()

@@ -147,7 +147,8 @@ def _flipped(top: NDArray[np.int64], span: NDArray[np.int64], flips: int) -> NDA
 
 def _cost(code: NDArray[np.uint64]) -> int:
     """Bits of the differences of codes in order: what rotation and flips of the axes are chosen by."""
-    return int(_bit_length(np.diff(np.sort(code), prepend=np.uint64(0))).sum())
+    ordered = np.sort(code)
+    return int(_bit_length(np.concatenate([ordered[:1], ordered[1:] - ordered[:-1]])).sum())
 
 
 def _bit_length(number: NDArray[np.uint64]) -> NDArray[np.int64]:

@@ -187,6 +187,6 @@ def parse_layout(payload: bytes, *, samples: int, channels: Channels) -> Layout:
         raise Corrupt(f"cloud: {len(payload)} bytes, its tokens ask for {ends[-1] + streams * samples}")
     starts = np.concatenate(([head], ends[:-1]))
     return Layout(
-        samples=samples, rotation=rotation, flips=flips, turn=turn, grid=grid, nbits=nbits, shift=shift, origin=(x, y, z),
-        window=window, starts=starts, tokens=int(ends[-1]),
+        samples=samples, rotation=rotation, flips=flips, turn=turn, grid=grid, nbits=nbits, shift=shift,
+        origin=(x, y, z), window=window, starts=starts, tokens=int(ends[-1]),
     )  # fmt: skip
