@@ -72,6 +72,8 @@ LIMITS: dict[Effort, _Limits] = {
     "fast": _Limits(window=16, hard=math.inf, gain=0.0),
 }
 
+SMALL = 1024
+"""Samples of a cloud whose blocks zstd takes for small."""
 ZSTD_MAGIC = bytes.fromhex("28b52ffd")
 MAX_FRAME_WINDOW = 1 << 27
 """What zstd itself takes as the most that a frame may ask of a reader."""
@@ -129,7 +131,10 @@ def _parameters(effort: Effort) -> zstandard.ZstdCompressionParameters:
     """Return the encoder settings. Matches shorter than 7 bytes cost more than they save in streams of tokens."""
     if effort == "best":
         return zstandard.ZstdCompressionParameters.from_level(19, min_match=7, write_checksum=True)
-    # Faster strategies reuse another stream's Huffman codes in blocks below 1 KiB: 7 to 12 % more at M = 512.
+    if effort == "fast":
+        return zstandard.ZstdCompressionParameters.from_level(
+            1, min_match=7, strategy=zstandard.STRATEGY_FAST, write_checksum=True
+        )
     return zstandard.ZstdCompressionParameters.from_level(
         6, min_match=7, strategy=zstandard.STRATEGY_LAZY, write_checksum=True
     )
@@ -157,7 +162,8 @@ def encode_cloud(
         Normals predicted by planes take about 0.7 bits a sample less, but such a cloud takes twice as long to decode
         and four times as long to encode. "best" tries planes on every cloud and lets zstd search longer. "default"
         tries them where position and normal take more than 20.5 bits a sample, and keeps them where they save 0.25.
-        "fast" never tries them and looks at fewer neighbours (docs/format.md, Choices of a writer).
+        "fast" never tries them, looks at fewer neighbours and lets zstd search less (docs/format.md, Choices of a
+        writer).
 
     Returns
     -------
@@ -197,13 +203,16 @@ def encode_clouds(
     encode = _codec(engine).encode
     limits = LIMITS[effort]
     compressor = _contexts.compressor(effort)
+    # Faster strategies reuse another stream's Huffman codes in blocks up to 1 KiB, which takes up to 20 % more.
+    small = _contexts.compressor("default" if effort == "fast" else effort)
     frames = []
     for begin, end in itertools.pairwise(edges):
-        frame, bits = _frame(encode(lattice, rows, begin, end, channels, limits.window), channels, compressor)
+        chosen = small if end - begin <= SMALL else compressor
+        frame, bits = _frame(encode(lattice, rows, begin, end, channels, limits.window), channels, chosen)
         if len(channels.normals) and bits > limits.hard * (end - begin):
             packed = encode(lattice, rows, begin, end, channels, limits.window, planes=True)
             if packed.grid:
-                other, _ = _frame(packed, channels, compressor)
+                other, _ = _frame(packed, channels, chosen)
                 if 8 * (len(frame) - len(other)) > limits.gain * (end - begin):
                     frame = other
         frames.append(frame)
