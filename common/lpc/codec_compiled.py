@@ -42,7 +42,7 @@ def encode(
     planes: bool = False,
 ) -> Packed:
     """Pack the samples begin to end, normals predicted by planes if that is asked for and worth it."""
-    rotation, nbits, shift, corner, code, order = _arrange(lattice, rows, begin, end)
+    rotation, flips, nbits, shift, corner, code, order = _arrange(lattice, rows, begin, end)
     k = end - begin
     position = np.empty((k, 3), np.uint16)
     before = np.empty(k, np.int64)
@@ -71,7 +71,7 @@ def encode(
         channels.normals, residuals,
     )  # fmt: skip
     x, y, z = corner.tolist()
-    return Packed(rotation, turn, grid, window, nbits, shift, (x, y, z), raw, tokens)
+    return Packed(rotation, flips, turn, grid, window, nbits, shift, (x, y, z), raw, tokens)
 
 
 def decode(payload: bytes, layout: Layout, channels: Channels) -> Unpacked:
@@ -85,7 +85,7 @@ def decode(payload: bytes, layout: Layout, channels: Channels) -> Unpacked:
     added = np.ones(len(channels), np.bool_)
     added[channels.normal_rows] = not layout.grid
     largest = _decode(
-        data, layout.starts, layout.tokens, layout.rotation, layout.shift, layout.window,
+        data, layout.starts, layout.tokens, layout.rotation, layout.flips, layout.nbits, layout.shift, layout.window,
         channels.bits, channels.start, added, position, low, before, rows,
     )  # fmt: skip
     if layout.grid:
@@ -272,7 +272,7 @@ def _residuals(value: Any, before: Any, bits: int, start: int, number: Any) -> N
 
 @njit(cache=True, nogil=True)
 def _arrange(lattice: Any, rows: Any, begin: int, end: int) -> Any:
-    """Sort samples; returns rotation, bits and low bits of a coordinate, corner, sorted codes and sample numbers."""
+    """Sort samples; returns rotation, flips, bits and low bits of coordinates, corner, codes and sample numbers."""
     k = end - begin
     corner = lattice[begin].copy()
     far = lattice[begin].copy()
@@ -284,24 +284,33 @@ def _arrange(lattice: Any, rows: Any, begin: int, end: int) -> Any:
     shift = max(0, width - 16)
     nbits = width - shift
 
-    spread = np.empty((k, 3), np.uint64)
-    for i in range(k):
-        for axis in range(3):
-            spread[i, axis] = _spread(np.uint64((lattice[begin + i, axis] - corner[axis]) >> shift))
+    span = np.empty(3, np.int64)
+    spread = np.empty((2, 3, k), np.uint64)
+    for axis in range(3):
+        span[axis] = (far[axis] - corner[axis]) >> shift
+        for i in range(k):
+            local = (lattice[begin + i, axis] - corner[axis]) >> shift
+            spread[0, axis, i] = _spread(np.uint64(local))
+            spread[1, axis, i] = _spread(np.uint64(span[axis] - local))
 
-    # The rotation that makes the differences shortest: it puts the thin axis in the top bit of every three.
+    # The rotation that makes the differences shortest puts the thin axis in the top bit of every three; the best flips
+    # let the curve follow slopes. Same limit as `payload.may_flip`.
     code = np.empty(k, np.uint64)
     order = np.empty(k, np.uint32)
     code_spare = np.empty(k, np.uint64)
     order_spare = np.empty(k, np.uint32)
     best_code = np.empty(k, np.uint64)
     best_order = np.empty(k, np.uint32)
-    rotation = 0
+    rotation = flips = 0
     least = np.int64(0)
-    for turn in range(3):
+    tries = 10 if shift == 0 and min(corner[0], corner[1], corner[2]) > (1 << 16) - (np.int64(1) << 52) else 3
+    for attempt in range(tries):
+        turn = attempt if attempt < 3 else rotation
+        flipped = max(attempt - 2, 0)
         a, b, c = turn, (turn + 1) % 3, (turn + 2) % 3
+        in_a, in_b, in_c = spread[flipped >> a & 1, a], spread[flipped >> b & 1, b], spread[flipped >> c & 1, c]
         for i in range(k):
-            code[i] = spread[i, a] | (spread[i, b] << np.uint64(1)) | (spread[i, c] << np.uint64(2))
+            code[i] = in_a[i] | (in_b[i] << np.uint64(1)) | (in_c[i] << np.uint64(2))
             order[i] = begin + i
         if _sort(code, order, code_spare, order_spare, 3 * nbits):
             code, code_spare = code_spare, code
@@ -311,9 +320,9 @@ def _arrange(lattice: Any, rows: Any, begin: int, end: int) -> Any:
         for i in range(k):
             cost += _bit_length(code[i] - last)
             last = code[i]
-        if turn == 0 or cost < least:
+        if attempt == 0 or cost < least:
             least = cost
-            rotation = turn
+            rotation, flips = turn, flipped
             code, best_code = best_code, code
             order, best_order = best_order, order
     code = best_code
@@ -325,7 +334,10 @@ def _arrange(lattice: Any, rows: Any, begin: int, end: int) -> Any:
             if i - first > 1:
                 _sort_ties(lattice, rows, order, first, i)
             first = i
-    return rotation, nbits, shift, corner, code, order
+    for axis in range(3):  # the last sample of a flipped axis stands at the end of its range
+        if flips >> axis & 1:
+            corner[axis] -= (1 << nbits) - 1 - span[axis]
+    return rotation, flips, nbits, shift, corner, code, order
 
 
 @njit(cache=True, nogil=True)
@@ -404,7 +416,7 @@ def _number(data: Any, bit: Any, token: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _decode(
-    data: Any, starts: Any, tokens: int, rotation: int, shift: int, window: int,
+    data: Any, starts: Any, tokens: int, rotation: int, flips: int, nbits: int, shift: int, window: int,
     bits: Any, start: Any, added: Any, position: Any, low: Any, before: Any, rows: Any,
 ) -> Any:  # fmt: skip
     """Fill in the arrays; rows that are not `added` up get their residuals, signed. Returns the largest code."""
@@ -420,13 +432,21 @@ def _decode(
     a, b, c = rotation, (rotation + 1) % 3, (rotation + 2) % 3
     code = np.uint64(0)
     largest = np.uint64(0)
+    reach = (1 << nbits) - 1
+    at_a, at_b, at_c = np.uint64(0), np.uint64(0), np.uint64(0)
+    if flips >> a & 1:
+        at_a = np.uint64(reach)
+    if flips >> b & 1:
+        at_b = np.uint64(reach)
+    if flips >> c & 1:
+        at_c = np.uint64(reach)
     bit = np.uint64(starts[1] * 8)
     for i in range(k):
         step, bit = _number(data, bit, data[tokens + i])
         code += step
         largest = max(largest, code)
         x, y, z = _gather(code), _gather(code >> np.uint64(1)), _gather(code >> np.uint64(2))
-        position[i, a], position[i, b], position[i, c] = x, y, z
+        position[i, a], position[i, b], position[i, c] = x ^ at_a, y ^ at_b, z ^ at_c
 
     if len(bits):
         _predecessors(position, window, before)

@@ -12,7 +12,7 @@ import numpy as np
 
 from .normals_numpy import best_planes, best_turn, from_planes
 from .normals_numpy import turn_back as turn_back
-from .payload import RAW_BITS, TOP_BITS, Layout, Packed, Unpacked, plane_window
+from .payload import RAW_BITS, TOP_BITS, Layout, Packed, Unpacked, may_flip, plane_window
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,11 +42,19 @@ def encode(
     nbits = width - shift
     top = local >> shift
 
-    rotation = min(range(3), key=lambda turn: _cost(np.sort(_morton(top, turn))))
-    code = _morton(top, rotation)
+    reach = (1 << nbits) - 1
+    span = top.max(axis=0)
+    rotation = min(range(3), key=lambda turn: _cost(_morton(top, turn)))
+    flips = 0
+    if may_flip(corner.tolist(), shift):
+        flips = min(range(8), key=lambda flips: _cost(_morton(_flipped(top, span, flips), rotation)))
+    code = _morton(_flipped(top, span, flips), rotation)
     order = np.lexsort((*rows[::-1], *local.T[::-1], code))
     code, top, local, rows = code[order], top[order], local[order], rows[:, order]
 
+    if flips:  # the last sample of a flipped axis stands at the end of its range
+        ahead = np.where(flips >> np.arange(3) & 1, reach - span, 0)
+        corner, top = corner - ahead, top + ahead
     low_bits = (local & ((1 << shift) - 1)).astype(np.uint64).ravel()
     streams = [_pack_bits(low_bits, np.full(low_bits.size, shift, np.int64))] if shift else []
     numbers = [np.diff(code, prepend=np.uint64(0))]
@@ -79,7 +87,7 @@ def encode(
         tokens[stream] = np.where(length < 2, number.astype(np.int64), ((length - 1) << 1) | next_bit)
         streams.append(_pack_bits(number & ((np.uint64(1) << raw.astype(np.uint64)) - np.uint64(1)), raw))
     x, y, z = corner.tolist()
-    return Packed(rotation, turn, grid, window, nbits, shift, (x, y, z), np.concatenate(streams), tokens)
+    return Packed(rotation, flips, turn, grid, window, nbits, shift, (x, y, z), np.concatenate(streams), tokens)
 
 
 def decode(payload: bytes, layout: Layout, channels: Channels) -> Unpacked:
@@ -95,7 +103,10 @@ def decode(payload: bytes, layout: Layout, channels: Channels) -> Unpacked:
     code = np.cumsum(_numbers(data, starts[1], tokens[0]), dtype=np.uint64)
     position = np.empty((k, 3), np.uint16)
     for slot in range(3):
-        position[:, (layout.rotation + slot) % 3] = _gather(code >> np.uint64(slot))
+        axis = (layout.rotation + slot) % 3
+        position[:, axis] = _gather(code >> np.uint64(slot))
+        if layout.flips >> axis & 1:
+            position[:, axis] ^= np.uint16((1 << layout.nbits) - 1)
 
     rows = np.empty((len(channels), k), np.uint32)
     if len(channels):
@@ -129,9 +140,15 @@ def _zigzag(row: NDArray[np.uint32], before: NDArray[np.int64], channels: Channe
     return np.where(residual >= levels >> 1, 2 * (levels - residual) - 1, 2 * residual).astype(np.uint64)
 
 
+def _flipped(top: NDArray[np.int64], span: NDArray[np.int64], flips: int) -> NDArray[np.int64]:
+    """Count the axes in `flips` down from their last sample."""
+    return np.where(flips >> np.arange(3) & 1, span - top, top)
+
+
 def _cost(code: NDArray[np.uint64]) -> int:
-    """Bits of the differences of sorted codes: what a rotation of the axes is chosen by."""
-    return int(_bit_length(np.diff(code, prepend=np.uint64(0))).sum())
+    """Bits of the differences of codes in order: what rotation and flips of the axes are chosen by."""
+    ordered = np.sort(code)
+    return int(_bit_length(np.concatenate([ordered[:1], ordered[1:] - ordered[:-1]])).sum())
 
 
 def _bit_length(number: NDArray[np.uint64]) -> NDArray[np.int64]:

@@ -48,6 +48,11 @@ def plane_window(window: int, channels: Channels) -> int:
     return min(window, PLANE_WINDOW) if len(channels) == 2 * len(channels.normals) else window
 
 
+def may_flip(corner: list[int], shift: int) -> bool:
+    """Whether a writer may flip axes: it moves the corner back by less than 2**16, which must not leave the lattice."""
+    return shift == 0 and min(corner) > (1 << TOP_BITS) - ORIGIN_LIMIT
+
+
 class Packed(NamedTuple):
     """What an encoder gives: the parts of a payload.
 
@@ -55,6 +60,7 @@ class Packed(NamedTuple):
     """
 
     rotation: int
+    flips: int
     turn: int
     grid: int
     window: int
@@ -84,7 +90,7 @@ class Layout:
 
     Parameters
     ----------
-    samples, rotation, turn, grid, nbits, shift, origin, window
+    samples, rotation, flips, turn, grid, nbits, shift, origin, window
         As in docs/format.md.
     starts : ndarray, (2 + c,) int64
         Byte offsets of the raw streams in the payload: low bits, position, channels.
@@ -94,6 +100,7 @@ class Layout:
 
     samples: int
     rotation: int
+    flips: int
     turn: int
     grid: int
     nbits: int
@@ -108,8 +115,9 @@ def pack_header(packed: Packed) -> bytes:
     """Return the bytes before the raw streams."""
     corner_bytes = max((corner ^ (corner >> 63)).bit_length() // 8 + 1 for corner in packed.origin)
     head = HEADER.pack(
-        CODEC, packed.rotation, packed.nbits, packed.shift, packed.window, packed.turn, corner_bytes, packed.grid
-    )
+        CODEC, packed.rotation | packed.flips << 2, packed.nbits, packed.shift, packed.window, packed.turn,
+        corner_bytes, packed.grid,
+    )  # fmt: skip
     return head + b"".join(corner.to_bytes(corner_bytes, "little", signed=True) for corner in packed.origin)
 
 
@@ -148,10 +156,11 @@ def parse_layout(payload: bytes, *, samples: int, channels: Channels) -> Layout:
     streams = 1 + len(channels)
     if len(payload) < HEADER.size + streams * samples:
         raise Corrupt(f"cloud: {len(payload)} bytes cannot hold {samples} samples")
-    codec, rotation, nbits, shift, window, turn, corner_bytes, grid = HEADER.unpack_from(payload)
+    codec, axes, nbits, shift, window, turn, corner_bytes, grid = HEADER.unpack_from(payload)
     if codec != CODEC:
         raise Corrupt(f"cloud: codec {codec} is unknown")
-    if rotation > 2 or turn >= TURNS or window > MAX_WINDOW or corner_bytes > MAX_CORNER_BYTES:
+    rotation, flips = axes & 3, axes >> 2
+    if rotation > 2 or flips > 7 or turn >= TURNS or window > MAX_WINDOW or corner_bytes > MAX_CORNER_BYTES:
         raise Corrupt(f"cloud: its header {payload[: HEADER.size].hex()} is out of range")
     if grid and (not FIRST_GRID <= grid <= LAST_GRID or samples > MAX_GRID_SAMPLES):
         raise Corrupt(f"cloud: grid {grid} of {samples} samples is out of range")
@@ -178,6 +187,6 @@ def parse_layout(payload: bytes, *, samples: int, channels: Channels) -> Layout:
         raise Corrupt(f"cloud: {len(payload)} bytes, its tokens ask for {ends[-1] + streams * samples}")
     starts = np.concatenate(([head], ends[:-1]))
     return Layout(
-        samples=samples, rotation=rotation, turn=turn, grid=grid, nbits=nbits, shift=shift, origin=(x, y, z),
-        window=window, starts=starts, tokens=int(ends[-1]),
+        samples=samples, rotation=rotation, flips=flips, turn=turn, grid=grid, nbits=nbits, shift=shift,
+        origin=(x, y, z), window=window, starts=starts, tokens=int(ends[-1]),
     )  # fmt: skip

@@ -162,7 +162,8 @@ def test_samples_come_in_morton_order() -> None:
             (int(point[axis]) >> bit & 1) << (3 * bit + slot) for bit in range(6) for slot, axis in enumerate(axes)
         )
 
-    orders = [[code(point, np.roll([0, 1, 2], -turn)) for point in position] for turn in range(3)]
+    sides = [np.where(flips, 63 - position, position) for flips in itertools.product((False, True), repeat=3)]
+    orders = [[code(point, np.roll([0, 1, 2], -turn)) for point in side] for side in sides for turn in range(3)]
     assert any(order == sorted(order) for order in orders)
 
 

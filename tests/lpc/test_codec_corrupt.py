@@ -108,6 +108,7 @@ def test_noise_is_corrupt_or_a_cloud(noise: bytes, samples: int, schema: Schema)
     [
         (0, 2, "codec 2"),
         (1, 3, "header"),
+        (1, 32, "header"),
         (2, 17, "17 \\+ 0 bits"),
         (3, 1, "bits a coordinate"),
         (3, 33, "bits a coordinate"),

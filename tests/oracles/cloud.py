@@ -36,7 +36,8 @@ def read_cloud(frame: bytes, samples: int, attributes: list[dict[str, Any]]) -> 
     """
     payload = zstandard.ZstdDecompressor().decompress(frame)
     assert payload[0] == 1
-    rotation, nbits, shift, window, turn, corner_bytes, grid = payload[1:8]
+    axes, nbits, shift, window, turn, corner_bytes, grid = payload[1:8]
+    rotation, flips = axes % 4, axes // 4
     at = 8
     corner = []
     for _ in range(3):
@@ -75,7 +76,7 @@ def read_cloud(frame: bytes, samples: int, attributes: list[dict[str, Any]]) -> 
         for i in range(nbits):
             for s in range(3):
                 point[(rotation + s) % 3] |= (code >> (3 * i + s) & 1) << i
-        top.append(point)
+        top.append([2**nbits - 1 - c if flips >> axis & 1 else c for axis, c in enumerate(point)])
     before: list[int | None] = []
     for i in range(samples):
         near = [(sum(abs(top[i][a] - top[j][a]) for a in range(3)), i - j) for j in range(max(0, i - window), i)]

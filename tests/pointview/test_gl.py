@@ -95,9 +95,10 @@ def test_other_splats(gl, scene, splat):
     style, backend, oracle = Style(splat=splat), gl(model.header), CpuBackend(model.header)
     for tolerance in (1.0, 6.0):
         cut = refine(model.index, camera, tolerance, model.everything)
-        # They have nearly one depth: where many overlap, more of them tie in the 24 bits of a depth buffer.
+        # They have nearly one depth: where many overlap, more of them tie in the 24 bits of a depth buffer, and the
+        # first one drawn stays. How often it is the nearest depends on the order of the samples in their clouds.
         expected = oracle.draw(cut, model.take, camera, style)
-        assert_same(backend.draw(cut, model.take, camera, style), expected, 3 * SHARE)
+        assert_same(backend.draw(cut, model.take, camera, style), expected, 8 * SHARE)
     backend.close()
 
 
