@@ -37,6 +37,7 @@ Everything is an argument: wants, time, and the state of the link. `offer` and `
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -56,6 +57,8 @@ class SchedulerOptions:
     ----------
     request_seconds : float
         Length of a request, seconds of the link.
+    reach_seconds : float
+        How much less urgent than the seed what comes along may be, seconds of the link.
     smallest_request, largest_request : int
         Bounds of that length in bytes.
     overhead : int
@@ -81,6 +84,7 @@ class SchedulerOptions:
     """
 
     request_seconds: float = 0.1
+    reach_seconds: float = 0.25
     smallest_request: int = 8192
     largest_request: int = 1 << 19
     overhead: int = 400
@@ -200,7 +204,7 @@ class Scheduler:
             seed = self._wants.next_seed()
             if seed < 0:
                 break
-            first, last = self._wants.grow(seed, self._widest_gap(link, outstanding), longest)
+            first, last = self._wants.grow(seed, self._widest_gap(link, outstanding), longest, self._reach(link))
             request = self._wants.request(first, last)
             if outstanding > 0 and outstanding + request.range.size > window:
                 break
@@ -283,6 +287,9 @@ class Scheduler:
         if link is None:
             return self.options.local_gap
         return self.options.overhead + max(0, int(link.rate * link.rtt) - outstanding)
+
+    def _reach(self, link: LinkState | None) -> float:
+        return math.inf if link is None else link.rate * self.options.reach_seconds
 
     def _fill_bucket(self, now: float, link: LinkState | None) -> None:
         passed = 0.0 if self._filled is None else max(0.0, now - self._filled)

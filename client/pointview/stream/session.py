@@ -21,6 +21,7 @@ from pointview.lookahead import Lookahead
 from pointview.occlusion import KEPT, Occlusion
 from pointview.refine import Cut, Priority, SplatRule, refine
 from pointview.render import Kind, Style, open_backend
+from pointview.urgency import Contrast
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -238,6 +239,7 @@ class _Session:
         self.recording = Recording()
         self.lookahead = Lookahead()
         self.occlusion: Occlusion | None = None
+        self.contrast: Contrast | None = None
         self.tested: tuple[object, ...] = ()
         self.steady = 0
 
@@ -305,6 +307,10 @@ class _Session:
             self.occlusion = None
         elif self.occlusion is None or len(self.occlusion.hidden) != nodes:
             self.occlusion = Occlusion(nodes)
+        if options.priority != "error" or options.splat_rule != "place":
+            self.contrast = None
+        elif self.contrast is None or len(self.contrast.shown) != nodes:
+            self.contrast = Contrast(nodes)
         return refine(
             layer.index,
             camera,
@@ -314,11 +320,12 @@ class _Session:
             splat_rule=options.splat_rule,
             cull_backfaces=not options.style.two_sided,
             hidden=None if self.occlusion is None else self.occlusion.hidden,
+            contrast=None if self.contrast is None else self.contrast.shown,
         )
 
     def _is_test_due(self, cut: Cut, camera: Camera) -> bool:
         """Tell whether the picture should be asked for what is hidden: every few frames, if anything changed."""
-        if self.occlusion is None or self.recording.frames % TEST_EVERY:
+        if (self.occlusion is None and self.contrast is None) or self.recording.frames % TEST_EVERY:
             return False
         state = (cut.nodes.tobytes(), camera)
         self.steady = self.steady + 1 if state == self.tested else 0
@@ -332,7 +339,11 @@ class _Session:
         for last in (False, True):
             clouds = {node: layer.take(node) for node in cut.nodes.tolist()}
             frame = await drawer(self.drawer, partial(backend.draw, cut, clouds.__getitem__, camera, style))
-            if self.occlusion is None or layer.index is not index:
+            if layer.index is not index:
+                break
+            if self.contrast is not None:
+                self.contrast.look(index, cut, camera, frame)
+            if self.occlusion is None:
                 break
             seen = self.occlusion.look(index, cut, camera, frame)
             if last or not seen:
