@@ -8,9 +8,10 @@ those allowed by the estimated network bandwidth, and forgetting the rest". A li
 1. *Wants are forgotten.* `offer` replaces all wants that are not in flight. Nothing queues here across a turn of the
    camera.
 2. *Neighbours travel together.* A request grows from the most urgent want (the seed) along the file, forward first,
-   then backward, over wants of any priority, while the gap between them is cheaper than a request. A request costs
-   its headers and, only when less than a round trip of bytes is outstanding, the time in which the link would run
-   dry: ``gap <= overhead + max(0, rate * rtt - outstanding)``.
+   then backward, over wants whose turn would come within `reach_seconds` of the link anyway (neighbours of any
+   urgency would turn an order by error into one by place), while the gap between them is cheaper than a request. A
+   request costs its headers and, only when less than a round trip of bytes is outstanding, the time in which the link
+   would run dry: ``gap <= overhead + max(0, rate * rtt - outstanding)``.
 3. *A request is short.* At most ``rate * request_seconds`` bytes, but at least one object, so that urgent ones get
    through between two requests and a lost one costs little. Not shorter either: on 1.25 Mbit/s, 0.1 s at a time, the
    heads of a usual server's replies (370 bytes) take 3% of the line.

@@ -243,7 +243,7 @@ def refine(
     hidden : (n_nodes,) bool, optional
         Nodes that `occlusion` found to be behind others: neither drawn nor refined nor wanted.
     contrast : (n_nodes,) float64, optional
-        Contrast of the nodes' cells in the last picture (`urgency`), by which the error is estimated.
+        What the last picture shows in the nodes' cells (`urgency.Contrast`), from which that error is estimated.
 
     Notes
     -----

@@ -1,19 +1,16 @@
 """Which missing cloud to ask for first: how much of the picture's error a byte of it removes.
 
-What a cloud removes is estimated from the picture that is shown. Where splats are too coarse, neighbouring ones differ
-by about as much as the picture is wrong there: shading in steps, fat rims before the background, blots of texture. So
-the *contrast* of a node's cell is the sum, over the pixels that show its surface, of the squared difference from their
-neighbours: visible area times squared error, with everything that hides the cell taken into account. Refining the cell
-leaves of it what is left of its projected spacing:
+What a cloud removes is estimated from the picture that is shown. Where splats are too coarse, those next to each other
+differ by about as much as the picture is wrong there: shading in steps, blots of texture, fat rims before the
+background. So the *contrast* of a node's cell is a sum over the pixels that show its surface: of the squared difference
+from the pixels half a spacing away. That is visible area times squared error, with whatever hides the cell taken into
+account. Refining the cell takes from it what it takes from the projected spacing:
 
-    removed = contrast (1 - s' / s) / bytes,    s, s' projected spacing in pixels before and after
+    removed = contrast * (1 - s' / s) / bytes,    s, s' projected spacing in pixels before and after
 
-A cell that no picture has shown yet takes its part of the nearest one around it that was, by *extent*: the part of its
-bounding sphere's disc that is inside the window, times its projected spacing. Without any picture, extent stands for
-contrast.
-
-Measured on single clouds of six scans in four views, the order by these figures removes 91% of what the exact order
-does beyond a random one; extent alone 46%, pixels that show the cell 71% (benchmarks/priorities.py --single).
+where s' below half the tolerance is as good as that. A cell that was not in the picture, or whose node came after it,
+takes its part of the nearest cell around it that was shown, by *extent*: the part of its bounding sphere's disc that is
+in the window, times its projected spacing. Where there is no picture yet, extent stands for contrast.
 """
 
 from __future__ import annotations
@@ -36,10 +33,15 @@ if TYPE_CHECKING:
     Nodes = NDArray[np.int64]
     Values = NDArray[np.float64]
 
-INSIDE = 0.3
 REACH = 0.5
+"""How far from a pixel its contrast is looked for, spacings: half of the pixels meet another splat there."""
+
+INSIDE = 0.3
+"""Least distance of a cell from the eye, radii of its sphere. At the nearest point of a sphere around the eye nothing
+is ever fine enough, and all clouds would be worth the same: nothing."""
+
 LEAST = 1e-3
-"""Of the contrast that its extent makes one expect, what any cell has: one behind others shows up when these get finer."""
+"""Contrast of a cell that the picture does not show, over what is usual for its extent: it may show up yet."""
 
 
 class Contrast:
@@ -53,7 +55,7 @@ class Contrast:
     Attributes
     ----------
     shown : (nodes,) float64
-        Squared levels times pixels; NaN where the picture did not tell.
+        Contrast, squared levels times pixels; NaN where the picture did not tell.
     """
 
     def __init__(self, nodes: int) -> None:
@@ -67,73 +69,77 @@ class Contrast:
         stride : int
             Look at every so many pixels of every so many lines.
         """
-        if cut.places is None or not len(cut.nodes):
+        if cut.places is None:
             return
         children = index.children[cut.nodes]
-        exists = children >= 0
-        shown = np.full(len(self.shown), np.nan)
-        shown[children[exists]] = contrast_by_cell(frame, cut, camera, reach=REACH, stride=stride)[exists]
-        known = np.flatnonzero(index.known & ~np.isnan(shown))
-        shown[known[extent(index, camera, known) == 0]] = np.nan  # outside the window: not looked at
-        self.shown = shown
+        sums = contrast_by_cell(frame, cut, camera, reach=REACH, stride=stride)[children >= 0]
+        nodes = children[children >= 0].astype(np.int64)
+        inside = np.ones(len(nodes), dtype=bool)
+        known = index.known[nodes]
+        inside[known] = extent(index, camera, nodes[known]) > 0
+        self.shown = np.full(len(self.shown), np.nan)
+        self.shown[nodes[inside]] = sums[inside]
 
 
 def removed_per_byte(
     index: IndexTree, camera: Camera, tolerance: float, nodes: Nodes, shown: Values | None
 ) -> NDArray[np.float64]:
-    """Screen error that fetching each of some missing nodes removes, per byte.
+    """Estimate the error that each of some missing nodes removes from the picture, per byte.
 
     Parameters
     ----------
+    tolerance : float
+        Pixels.
     nodes : (n,) int64
         Not the root. Unknown ones come first (infinite): their page costs little and hides what else is wanted.
-    shown : (nodes,) float64, optional
-        `Contrast.shown`.
+    shown : (nodes of the model,) float64, optional
+        `Contrast.shown`; None before the first picture.
+
+    Returns
+    -------
+    (n,) float64
+        To be compared with each other only.
     """
-    out = np.full(len(nodes), np.inf)
+    removed = np.full(len(nodes), np.inf)
     known = index.known[nodes]
     nodes = nodes[known]
     scale = camera.focal / _away(index, camera, nodes)
     before = index.density.coarseness[index.parent[nodes]] * scale
     after = np.maximum(index.density.coarseness[nodes] * scale, 0.5 * tolerance)
     fall = np.clip(1.0 - after / np.maximum(before, 1e-300), 0.0, 1.0)
-    out[known] = _expected(index, camera, nodes, shown) * fall / np.maximum(index.size[nodes], 1)
-    return out
+    removed[known] = expected(index, camera, nodes, shown) * fall / np.maximum(index.size[nodes], 1)
+    return removed
 
 
-def _expected(index: IndexTree, camera: Camera, nodes: Nodes, shown: Values | None) -> Values:
-    """Contrast of some known nodes' cells: as shown, or from the nearest cell around them that was."""
-    expected = extent(index, camera, nodes)
+def expected(index: IndexTree, camera: Camera, nodes: Nodes, shown: Values | None) -> Values:
+    """Contrast of the cells of some known nodes: as shown, or the part of it that they have in a cell around them."""
+    own = extent(index, camera, nodes)
     if shown is None:
-        return expected
-    around = nodes.copy()
+        return own
+    around = nodes
     while (unseen := np.isnan(shown[around]) & (around > 0)).any():
-        around[unseen] = index.parent[around[unseen]]
-    there = shown[around]
-    if np.isnan(there).all():
-        return expected
-    total = extent(index, camera, around)
+        around = np.where(unseen, index.parent[around], around)
+    there, total = shown[around], extent(index, camera, around)
     rate = np.divide(there, total, out=np.full(len(nodes), np.nan), where=total > 0)
-    typical = np.nanmedian(rate[rate > 0]) if (rate > 0).any() else 1.0
-    rate = np.fmax(rate, LEAST * typical)
-    return np.asarray(expected * np.where(np.isnan(rate), LEAST * typical, rate))
+    usual = float(np.median(rate[rate > 0])) if (rate > 0).any() else 1.0
+    return np.asarray(own * np.where(np.isnan(rate), usual, np.maximum(rate, LEAST * usual)))
 
 
 def extent(index: IndexTree, camera: Camera, nodes: Nodes) -> Values:
-    """Part of the spheres' discs inside the window, square pixels, times the projected spacing of the parents."""
-    place = camera.to_camera(index.center[nodes])
-    radius, focal = index.radius[nodes], camera.focal
-    depth = np.maximum(place[:, 2], radius)
-    disc = np.maximum(radius * focal / np.maximum(depth, 1e-300), 0.5)
+    """Part of the discs of known nodes' spheres that is in the window, square pixels, times the projected spacing."""
+    place, radius = camera.to_camera(index.center[nodes]), index.radius[nodes]
+    scale = camera.focal / np.maximum(np.maximum(place[:, 2], radius), 1e-300)
+    reach = np.maximum(radius * scale, 0.5)
     area = np.ones(len(nodes))
     for axis, side in enumerate((camera.width, camera.height)):
-        middle = place[:, axis] * focal / np.maximum(depth, 1e-300)
-        area *= np.maximum(np.minimum(middle + disc, side / 2) - np.maximum(middle - disc, -side / 2), 0.0)
-    coarseness = index.density.coarseness[np.maximum(index.parent[nodes], 0)]
-    return np.asarray(area * coarseness * focal / _away(index, camera, nodes))
+        middle = place[:, axis] * scale
+        area *= np.maximum(np.minimum(middle + reach, side / 2) - np.maximum(middle - reach, -side / 2), 0.0)
+    shown = index.density.coarseness[np.maximum(index.parent[nodes], 0)]
+    return np.asarray(area * shown * camera.focal / _away(index, camera, nodes))
 
 
 def _away(index: IndexTree, camera: Camera, nodes: Nodes) -> Values:
-    """Distance of the nearest point of the spheres, but for an eye near to them or inside: their radius."""
-    center, radius = index.center[nodes], index.radius[nodes]
-    return np.maximum(np.maximum(np.linalg.norm(center - np.array(camera.eye), axis=1) - radius, INSIDE * radius), 1e-300)
+    """Distance of the cells from the eye."""
+    radius = index.radius[nodes]
+    gap = np.linalg.norm(index.center[nodes] - np.array(camera.eye), axis=1) - radius
+    return np.maximum(np.maximum(gap, INSIDE * radius), 1e-300)

@@ -51,9 +51,7 @@ def pixels_by_cell(depth: NDArray[np.float32], cut: Cut, camera: Camera, *, stri
     return counts[: len(cut.nodes)]
 
 
-def contrast_by_cell(
-    frame: Frame, cut: Cut, camera: Camera, *, reach: float, stride: int = 1
-) -> NDArray[np.float64]:
+def contrast_by_cell(frame: Frame, cut: Cut, camera: Camera, *, reach: float, stride: int = 1) -> NDArray[np.float64]:
     """Sum up how much the pixels in each half of the cell of each node of a cut differ from others near them.
 
     Parameters

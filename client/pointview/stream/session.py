@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 Clock = Callable[[], float]
 
 TEST_EVERY = 6
-"""Frames from one test of what is hidden to the next."""
+"""Frames from one look at what the picture shows to the next."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -324,13 +324,14 @@ class _Session:
         )
 
     def _is_test_due(self, cut: Cut, camera: Camera) -> bool:
-        """Tell whether the picture should be asked for what is hidden: every few frames, if anything changed."""
-        if (self.occlusion is None and self.contrast is None) or self.recording.frames % TEST_EVERY:
+        """Tell whether the picture should be asked for what it shows: every few frames, if anything changed."""
+        asks = self.occlusion is not None or (self.contrast is not None and len(cut.wants) > 0)
+        if not asks or self.recording.frames % TEST_EVERY:
             return False
         state = (cut.nodes.tobytes(), camera)
         self.steady = self.steady + 1 if state == self.tested else 0
         self.tested = state
-        return self.steady <= KEPT
+        return self.steady <= (0 if self.occlusion is None else KEPT)
 
     async def _draw(self, backend: Backend, cut: Cut, camera: Camera) -> tuple[Cut, Frame]:
         """Draw a cut, and once more with what it shows to be visible after all (LPC 4: the third pass)."""
