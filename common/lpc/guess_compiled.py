@@ -1,0 +1,318 @@
+"""Normals and colours guessed from the context of a cloud, in compiled kernels; `guess_numpy` is the oracle.
+
+All integers (docs/format.md, Context); a float only stands for an integer below 2**53.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numba import njit
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from .channels import Channels
+    from .context import Near
+
+KEPT = 7
+MOST = 64
+DIGIT = 12
+
+
+def inside(
+    position: NDArray[np.uint16], low: tuple[int, int, int], high: tuple[int, int, int], away: tuple[int, int, int]
+) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
+    """Coordinates plus `away` of the samples from `low` to `high`, (3, n), and their numbers."""
+    place = np.empty((3, len(position)), np.int32)
+    index = np.empty(len(position), np.intp)
+    count = _inside(position, low, high, away, place, index)
+    return place[:, :count], index[:count]
+
+
+def add_guesses(
+    position: NDArray[np.uint16], rows: NDArray[np.uint32], near: Near, channels: Channels, nbits: int
+) -> None:
+    """Turn the residuals of guessed channels, signed in uint32, into codes, in place."""
+    _guess(near.position, near.rows, position, rows, channels.guessed, nbits, True)
+
+
+def without_guesses(
+    position: NDArray[np.uint16], rows: NDArray[np.uint32], near: Near, channels: Channels, nbits: int
+) -> NDArray[np.uint32]:
+    """Residuals of guessed channels, zigzag, (g, k)."""
+    found = rows.copy()
+    _guess(near.position, near.rows, position, found, channels.guessed, nbits, False)
+    return found[channels.guessed_rows]
+
+
+@njit(cache=True, nogil=True)
+def _inside(position: Any, low: Any, high: Any, away: Any, place: Any, index: Any) -> int:
+    count = 0
+    for i in range(len(position)):
+        x, y, z = np.int64(position[i, 0]), np.int64(position[i, 1]), np.int64(position[i, 2])
+        place[0, count], place[1, count], place[2, count] = x + away[0], y + away[1], z + away[2]
+        index[count] = i
+        count += (low[0] <= x) & (x <= high[0]) & (low[1] <= y) & (y <= high[1]) & (low[2] <= z) & (z <= high[2])
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _spread(value: Any) -> Any:
+    """8 bits to every third of 24."""
+    value = (value | (value << np.uint32(8))) & np.uint32(0x0000F00F)
+    value = (value | (value << np.uint32(4))) & np.uint32(0x000C30C3)
+    return (value | (value << np.uint32(2))) & np.uint32(0x00249249)
+
+
+@njit(cache=True, nogil=True)
+def _code(x: Any, y: Any, z: Any, ahead: int, shift: int) -> Any:
+    """Morton code of a place in one of the orders."""
+    low = _spread(np.uint32((np.int64(x) + ahead) >> shift))
+    middle = _spread(np.uint32((np.int64(y) + ahead) >> shift))
+    return low | (middle << np.uint32(1)) | (_spread(np.uint32((np.int64(z) + ahead) >> shift)) << np.uint32(2))
+
+
+@njit(cache=True, nogil=True)
+def _sort(code: Any, order: Any, code_spare: Any, order_spare: Any, count: Any) -> None:
+    """Radix sort of 24 bits, stable, in two passes: the result lies where it was."""
+    mask = np.uint32((1 << DIGIT) - 1)
+    count[:] = 0
+    for i in range(len(code)):
+        count[0, code[i] & mask] += 1
+        count[1, code[i] >> np.uint32(DIGIT)] += 1
+    first = second = np.int32(0)
+    for digit in range(1 << DIGIT):
+        here = count[0, digit]
+        count[0, digit] = first
+        first += here
+        here = count[1, digit]
+        count[1, digit] = second
+        second += here
+    for i in range(len(code)):
+        digit = code[i] & mask
+        to = count[0, digit]
+        count[0, digit] = to + 1
+        code_spare[to], order_spare[to] = code[i], order[i]
+    for i in range(len(code)):
+        digit = code_spare[i] >> np.uint32(DIGIT)
+        to = count[1, digit]
+        count[1, digit] = to + 1
+        order[to] = order_spare[i]
+
+
+@njit(cache=True, nogil=True)
+def _beside(near: Any, position: Any, nbits: int, company: Any) -> None:
+    """Numbers of the two context samples before and the two after each sample in both orders; n: there is none."""
+    k, n = len(position), near.shape[1]
+    code, code_spare = np.empty(k + n, np.uint32), np.empty(k + n, np.uint32)
+    order, order_spare = np.empty(k + n, np.uint32), np.empty(k + n, np.uint32)
+    count = np.empty((2, 1 << DIGIT), np.int32)
+    shift = max(0, nbits - KEPT)
+    for which in range(2):
+        ahead = which * ((1 << nbits) // 3)
+        # The cloud's own come first: of equal codes those of the context stand after them.
+        for i in range(k):
+            code[i], order[i] = _code(position[i, 0], position[i, 1], position[i, 2], ahead, shift), i
+        for i in range(n):
+            code[k + i], order[k + i] = _code(near[0, i], near[1, i], near[2, i], ahead, shift), k + i
+        _sort(code, order, code_spare, order_spare, count)
+        one = two = np.uint32(n)
+        for at in range(k + n):
+            i = order[at]
+            if i < k:
+                company[i, 4 * which], company[i, 4 * which + 1] = one, two
+            else:
+                one, two = i - np.uint32(k), one
+        one = two = np.uint32(n)
+        for at in range(k + n - 1, -1, -1):
+            i = order[at]
+            if i < k:
+                company[i, 4 * which + 2], company[i, 4 * which + 3] = one, two
+            else:
+                one, two = i - np.uint32(k), one
+
+
+@njit(cache=True, nogil=True)
+def _unfold(first: Any, second: Any, centre: Any) -> Any:
+    """Integer point of the octahedron |x| + |y| + |z| = centre of two codes; 0 for no normal."""
+    if first == 0 and second == 0:
+        return 0, 0, 0
+    x, y = np.int64(first) - centre, np.int64(second) - centre
+    z = centre - abs(x) - abs(y)
+    if z < 0:
+        x, y = (centre - abs(y)) * (1 if x >= 0 else -1), (centre - abs(x)) * (1 if y >= 0 else -1)
+    return x, y, z
+
+
+@njit(cache=True, nogil=True)
+def _fold(x: Any, y: Any, z: Any, centre: Any) -> Any:
+    """Canonical codes of an integer point of the octahedron; 0 for no normal."""
+    if x == 0 and y == 0 and z == 0:
+        return 0, 0
+    if z < 0:
+        x, y = (centre - abs(y)) * (1 if x >= 0 else -1), (centre - abs(x)) * (1 if y >= 0 else -1)
+    return x + centre, y + centre
+
+
+@njit(cache=True, nogil=True)
+def _chroma(code: Any, bits: int) -> Any:
+    """Chroma with its sign."""
+    value = np.int64(code)
+    return value - ((value & (1 << bits)) << 1)
+
+
+@njit(cache=True, nogil=True)
+def _value(rows: Any, row: int, i: int, normal: int, bits: int, values: Any, to: int, at: int) -> None:
+    """Set three signed numbers of a field: the point of a normal, or a colour's YCoCg-R."""
+    if normal:
+        x, y, z = _unfold(rows[row, i], rows[row + 1, i], (1 << (bits - 1)) - 1)
+    else:
+        x, y, z = np.int64(rows[row, i]), _chroma(rows[row + 1, i], bits), _chroma(rows[row + 2, i], bits)
+    values[to, at], values[to, at + 1], values[to, at + 2] = x, y, z
+
+
+@njit(cache=True, nogil=True)
+def _zigzag(residual: Any, bits: Any) -> Any:
+    levels = np.int64(1) << bits
+    residual &= levels - 1
+    return 2 * residual if residual < levels >> 1 else 2 * (levels - residual) - 1
+
+
+@njit(cache=True, nogil=True)
+def _part(side: Any, centre: Any, length: Any) -> Any:
+    """Share of a side in the length, in units of 1 / centre, rounded to the nearest."""
+    # Numbers below 2**53, quotients below 2**16: cutting the float cuts the quotient.
+    part = np.int64(np.float64(2 * centre * abs(side) + length) / np.float64(2 * length))
+    return part if side >= 0 else -part
+
+
+@njit(cache=True, nogil=True)
+def _normal(
+    x: Any, y: Any, z: Any, rows: Any, row: Any, i: int, bits: Any, decoding: bool, values: Any, own: Any, at: Any
+) -> Any:
+    """Decode or encode a normal whose guess lies along (x, y, z); whether it is one."""
+    centre = (np.int64(1) << (bits - 1)) - 1
+    length = max(abs(x) + abs(y) + abs(z), 1)
+    if abs(x) >= abs(y) and abs(x) >= abs(z):
+        largest = 0
+        x, y, z = y, z, x
+    elif abs(y) >= abs(z):
+        largest = 1
+        x, y, z = z, x, y
+    else:
+        largest = 2
+    sign = -1 if z < 0 else 1
+    guess_x, guess_y = _part(x, centre, length) + centre, _part(y, centre, length) + centre
+    if not decoding:
+        x, y, z = values[own, at + (largest + 1) % 3], values[own, at + (largest + 2) % 3], values[own, at + largest]
+        first, second = _fold(x, y, z * sign, centre)
+        rows[row, i], rows[row + 1, i] = _zigzag(first - guess_x, bits), _zigzag(second - guess_y, bits)
+        return True
+    mask = (np.int64(1) << bits) - 1
+    first = (guess_x + np.int64(np.int32(rows[row, i]))) & mask
+    second = (guess_y + np.int64(np.int32(rows[row + 1, i]))) & mask
+    x, y, z = _unfold(first, second, centre)
+    z *= sign
+    if largest == 0:
+        x, y, z = z, x, y
+    elif largest == 1:
+        x, y, z = y, z, x
+    values[own, at], values[own, at + 1], values[own, at + 2] = x, y, z
+    rows[row, i], rows[row + 1, i] = _fold(x, y, z, centre)
+    return first <= 2 * centre and second <= 2 * centre
+
+
+@njit(cache=True, nogil=True)
+def _mean(total: Any, weight: Any) -> Any:
+    """Mean rounded to the nearest, halves up; 0 where there is nothing."""
+    return (2 * total + weight) // (2 * weight) if weight else np.int64(0)
+
+
+@njit(cache=True, nogil=True)
+def _color(
+    x: Any, y: Any, z: Any, total: Any, rows: Any, row: Any, i: int, bits: Any, decoding: bool, values: Any, own: Any,
+    at: Any,
+) -> None:  # fmt: skip
+    """Decode or encode a colour of such sums."""
+    y_guess, co_guess, cg_guess = _mean(x, total), _mean(y, total), _mean(z, total)
+    if not decoding:
+        rows[row, i] = _zigzag(values[own, at] - y_guess, bits)
+        rows[row + 1, i] = _zigzag(values[own, at + 1] - co_guess, bits + 1)
+        rows[row + 2, i] = _zigzag(values[own, at + 2] - cg_guess, bits + 1)
+        return
+    mask = (np.int64(1) << bits) - 1
+    rows[row, i] = (y_guess + np.int64(np.int32(rows[row, i]))) & mask
+    mask = 2 * mask + 1
+    rows[row + 1, i] = (co_guess + np.int64(np.int32(rows[row + 1, i]))) & mask
+    rows[row + 2, i] = (cg_guess + np.int64(np.int32(rows[row + 2, i]))) & mask
+    _value(rows, row, i, 0, bits, values, own, at)
+
+
+@njit(cache=True, nogil=True)
+def _guess(near: Any, near_rows: Any, position: Any, rows: Any, guessed: Any, nbits: int, decoding: bool) -> None:
+    """Decode the rows that are guessed, or encode them, in place."""
+    k, n, fields = len(position), near.shape[1], len(guessed)
+    company = np.empty((k, 8), np.uint32)
+    _beside(near, position, nbits, company)
+    # Who is missing, number n, stands far away and is worth nothing.
+    place = np.empty((n + 1 + k, 4), np.int64)
+    place[n] = 1 << 30
+    values = np.zeros((n + 1 + k, 3 * fields), np.int32)
+    for axis in range(3):
+        for i in range(n):
+            place[i, axis] = near[axis, i]
+        for i in range(k):
+            place[n + 1 + i, axis] = position[i, axis]
+    row = 0
+    for field in range(fields):
+        for i in range(n):
+            _value(near_rows, row, i, guessed[field, 1], guessed[field, 2], values, i, 3 * field)
+        if not decoding:
+            for i in range(k):
+                _value(rows, guessed[field, 0], i, guessed[field, 1], guessed[field, 2], values, n + 1 + i, 3 * field)
+        row += 2 if guessed[field, 1] else 3
+
+    rows_of, normals, widths = guessed[:, 0].copy(), guessed[:, 1].copy(), guessed[:, 2].copy()
+    sound = np.ones(fields, np.bool_)
+    member = np.empty(10, np.int64)
+    weight = np.empty(10, np.int64)
+    distance = np.empty(10, np.float64)
+    bits_of = distance.view(np.int64)
+    for layer in range(3):
+        start, step, reach = (0, 4, 0) if layer == 0 else (2, 4, 2) if layer == 1 else (1, 2, 1)
+        for i in range(start, k, step):
+            own = n + 1 + i
+            for which in range(8):
+                member[which] = company[i, which]
+            member[8] = own - reach if reach else n
+            member[9] = own + reach if reach and i + reach < k else n
+            x, y, z = place[own, 0], place[own, 1], place[own, 2]
+            for m in range(10):
+                dx, dy, dz = place[member[m], 0] - x, place[member[m], 1] - y, place[member[m], 2] - z
+                distance[m] = np.float64(dx * dx + dy * dy + dz * dz + 1)
+            nearest = bits_of[0]
+            for m in range(1, 10):
+                nearest = min(nearest, bits_of[m])
+            nearest >>= 51
+            total = np.int64(0)
+            for m in range(10):
+                weight[m] = np.int64(MOST) >> min((bits_of[m] >> 51) - nearest, 7)
+                total += weight[m]
+            for field in range(fields):
+                at = 3 * field
+                x, y, z = np.int64(0), np.int64(0), np.int64(0)
+                for m in range(10):
+                    x += weight[m] * values[member[m], at]
+                    y += weight[m] * values[member[m], at + 1]
+                    z += weight[m] * values[member[m], at + 2]
+                row, bits = rows_of[field], widths[field]
+                if normals[field]:
+                    sound[field] &= _normal(x, y, z, rows, row, i, bits, decoding, values, own, at)
+                else:
+                    _color(x, y, z, total, rows, row, i, bits, decoding, values, own, at)
+    if decoding:
+        for field in range(fields):
+            if not sound[field]:
+                rows[guessed[field, 0], :] = (1 << guessed[field, 2]) - 1
