@@ -28,7 +28,7 @@ def main() -> None:
         scattered[0] = True
         cuts = [(tolerance, model.everything) for tolerance in (1.0, 2.0, 4.0, 8.0)]
         cuts += [(1.0, model.first(nodes)) for nodes in (1, 8, 40, 100)] + [(1.0, scattered)]
-        for style, kind in ((Style(), "discs"), (Style(two_sided=True, oriented=False), "facing")):
+        for style, kind in ((Style(), "discs"), (Style(two_sided=True, splat="round"), "facing")):
             for tolerance, resident in cuts:
                 cut = refine(model.index, camera, tolerance, resident, cull_backfaces=not style.two_sided)
                 frame = backend.draw(cut, model.take, camera, style)

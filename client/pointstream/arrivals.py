@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from .scheduler import Item
+    from .offers import Item
 
 
 class Assembly:

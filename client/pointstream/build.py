@@ -11,8 +11,8 @@ import numpy as np
 
 from lpc.ranges import ByteRange
 
+from .offers import Item
 from .residency import Residency
-from .scheduler import Item
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -84,15 +84,16 @@ class Build:
             self.length = length
             self.absent |= self.index.known & ~self.index.available(length)
 
-    def add(self, node: int, cloud: Cloud) -> None:
-        """Make a decoded cloud resident."""
+    def add(self, node: int, cloud: Cloud, *, ahead: bool = False) -> list[int]:
+        """Make a decoded cloud resident, or not if it came ahead of any want and there is no room; return what went."""
         self.clouds[node] = cloud
-        self.drop(self.residency.add(node, cloud.nbytes))
+        return self.drop(self.residency.add(node, cloud.nbytes, ahead=ahead))
 
-    def drop(self, nodes: list[int]) -> None:
-        """Let go of evicted clouds."""
+    def drop(self, nodes: list[int]) -> list[int]:
+        """Let go of evicted clouds; return them."""
         for node in nodes:
             del self.clouds[node]
+        return nodes
 
     def failed(self, key: int, tries: int) -> bool:
         """Count a damaged cloud or page; True if that was the last try and it stays missing."""
@@ -129,6 +130,17 @@ class Build:
         """Return a page as an object to fetch; its key is ``~page``, those of clouds are their nodes."""
         place = self.index.page_range(page)
         return Item(~page, place.start, place.stop)
+
+    def places(
+        self, pages: NDArray[np.int64], nodes: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+        """Keys of pages and clouds, where they start and stop in the file, and which the store holds itself."""
+        places = np.array([self.page_item(page) for page in pages.tolist()], dtype=np.int64).reshape(-1, 3)
+        start = self.index.offset[nodes]
+        keys = np.concatenate([places[:, 0], nodes])
+        starts = np.concatenate([places[:, 1], start])
+        stops = np.concatenate([places[:, 2], start + self.index.size[nodes]])
+        return keys, starts, stops, np.concatenate([self._store.holds(places[:, 1], places[:, 2]), self.held[nodes]])
 
     def has(self, item: Item) -> bool:
         """Whether the store can give an object."""

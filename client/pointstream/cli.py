@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lpc.errors import ScanError
+from lpc.errors import LpcError, ScanError
 
 from .arguments import BOUNDS, COUNT, DEEPEST, POSITIVE
 from .cache import Cache
@@ -114,6 +114,9 @@ def export(
         total = opened.count(**choice)  # type: ignore[arg-type]
         # Counts stand at the head of most formats, so what the bounds cut is counted first.
         count = total if bounds is None else sum(map(len, _batches(opened, "counting", total, choice)))
+        if not count:
+            spans = ",".join(f"{value:.9g}" for value in header.bounds)
+            raise LpcError(f"{model}: no sample that is here is inside the bounds; the whole model spans {spans}")
         target = Target(
             count=count,
             attributes=opened.attributes,
@@ -124,7 +127,7 @@ def export(
             crs=header.crs,
         )
         dropped = write_points(out, _batches(opened, "exporting", count, choice), target)
-        complete = opened.info["complete"]
+        complete = opened.complete
     click.echo(f"{out}: {count} samples" + ("" if complete else " of a file that is cut short"), err=True)
     for name in dropped:
         click.echo(f"{out}: left out {name}, the format has no room for it", err=True)
@@ -224,7 +227,8 @@ def _rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "levels", str(facts["levels"])
     yield "bytes", f"{facts['bytes']:,}"
     if not facts["complete"]:
-        yield "incomplete", "the file was cut short: what is here is a coarser model"
+        here = facts["here"]
+        yield "incomplete", f"here is a coarser model: {here['samples']:,} of the samples in {here['clouds']:,} clouds"
     yield "bits per sample", ", ".join(f"{name} {value:.2f}" for name, value in bits.items() if value)
     yield "spacing", f"{facts['spacing']:.6g}"
     yield "spacing, stored / LPC", " ".join(f"{ratio:.3f}" for ratio in facts["spacing_ratio"]) + "  (5%, 50%, 95%)"
@@ -232,6 +236,10 @@ def _rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "from", " ".join(f"{value:.10g}" for value in low)
     yield "to", " ".join(f"{value:.10g}" for value in high)
     yield "attributes", ", ".join(facts["attributes"]) or "none"
+    for name, error in facts["attribute_errors"].items():
+        cost = f"{facts['attribute_bits'][name]:.2f} bits, " if name in facts["attribute_bits"] else ""
+        unit = " degrees" if name == "normal" else ""
+        yield name, cost + (f"within {error:.3g}{unit}" if error else "as it came")
     for name, value in facts["constants"].items():
         yield f"{name} everywhere", str(value)
     yield "crs", crs_name(facts["crs"]) if facts["crs"] else "none"
@@ -276,6 +284,8 @@ def _print_report(report: VerifyReport) -> None:
         click.echo(f"largest position error {match.max_position_error:.6g}")
         if match.max_normal_error_degrees is not None:
             click.echo(f"largest normal error {match.max_normal_error_degrees:.4f} degrees")
+        if match.max_color_error is not None:
+            click.echo(f"largest colour error {match.max_color_error}")
     for problem in report.problems:
         click.echo(f"problem: {problem}")
     click.echo("ok" if report.ok else "not ok")

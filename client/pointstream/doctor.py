@@ -122,10 +122,15 @@ def diagnose(seen: Observations) -> list[Finding]:
     findings = [*ranges]
     if seen.first.status in (200, 206):
         findings.append(_model(seen))
-    if not any(finding.level == "failure" for finding in ranges):
+    if can_serve(ranges):
         findings += [_tags(seen), _compression(seen), _end(seen), _cors(seen), _connections(seen), _rest(seen)]
         findings += _link(seen)
     return [finding for finding in findings if finding.text]
+
+
+def advisable(findings: list[Finding]) -> bool:
+    """Whether lines in the configuration of the host would help; none puts a model where nothing stands."""
+    return any(found.level in ("advice", "failure") and found.topic not in ("address", "model") for found in findings)
 
 
 def can_serve(findings: list[Finding]) -> bool:
@@ -140,7 +145,7 @@ def _ranges(seen: Observations) -> list[Finding]:
         whole = f" ({size} bytes)" if size else ""
         return [Finding(topic, "failure", f"Range is ignored: the whole file comes{whole}. Only tiny models work so.")]
     if first.status != 206:
-        return [Finding(topic, "failure", f"answers {first.status}: {_meaning(first.status)}.")]
+        return [Finding("address", "failure", f"the host answers {first.status}: {_meaning(first.status)}.")]
     if (coding := first.headers.get("content-encoding", "identity")) != "identity":
         return [
             Finding(topic, "failure", f"ranges come coded as {coding} although identity was asked for: switch it off.")

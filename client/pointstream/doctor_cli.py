@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from lpc.errors import StoreError
+
 from .arguments import Number
-from .doctor import can_serve, diagnose
+from .doctor import advisable, can_serve, diagnose
 from .remedies import recipes_for
 
 if TYPE_CHECKING:
@@ -28,12 +30,16 @@ def doctor(url: str, as_json: bool, rest: float) -> None:
 
     Asks a dozen times, reads at most 3 MB.
     """
-    from .probe import ProbeOptions, probe
+    from .probe import ProbeOptions, parse_address, probe
 
+    try:
+        parse_address(url)
+    except StoreError as error:
+        raise click.BadParameter(str(error), param_hint="URL") from error
     seen = asyncio.run(probe(url, clock=time.perf_counter, options=ProbeOptions(rest=rest)))
     findings = diagnose(seen)
     able = can_serve(findings)
-    recipes = recipes_for(seen.first.headers.get("server")) if any(_needs_change(f) for f in findings) else {}
+    recipes = recipes_for(seen.first.headers.get("server")) if advisable(findings) else {}
     if as_json:
         click.echo(json.dumps(_to_json(seen, findings, able, dict(recipes))))
     else:
@@ -42,17 +48,16 @@ def doctor(url: str, as_json: bool, rest: float) -> None:
         click.get_current_context().exit(1)
 
 
-def _needs_change(finding: Finding) -> bool:
-    return finding.level in ("advice", "failure") and finding.topic != "model"
-
-
 def _print(seen: Observations, findings: list[Finding], able: bool, recipes: dict[str, str]) -> None:
     click.echo(f"{seen.address} ({seen.first.headers.get('server', 'does not say what it is')})")
     for finding in findings:
         click.echo(f"  {_MARKS[finding.level]} {finding.topic}: {finding.text}")
     advice = sum(finding.level == "advice" for finding in findings)
     better = f", and could do better in {advice}" if advice else ""
-    click.echo(f"This host can serve models{better}." if able else "This host cannot serve models as it is.")
+    if any(finding.topic == "address" for finding in findings):
+        click.echo("Nothing can be said of the host without a model on it: give the address of one.")
+    else:
+        click.echo(f"This host can serve models{better}." if able else "This host cannot serve models as it is.")
     for name, lines in recipes.items():
         click.echo(f"\nFor {name}:\n")
         click.echo("\n".join(f"    {line}" for line in lines.strip().splitlines()))

@@ -102,6 +102,9 @@ class AccessLayer:
             bytes_received=self._traffic.received if meter is None else meter.received_bytes,
             requests=self._traffic.requests if meter is None else meter.requests,
             payload_bytes=self._traffic.payload,
+            speculative_bytes=self._traffic.foresight.received,
+            idle_bytes=self._traffic.foresight.idle,
+            wasted_bytes=self._traffic.foresight.wasted,
             in_flight=self._traffic.scheduler.in_flight,
             outstanding_bytes=self._traffic.scheduler.outstanding,
             goodput=None if meter is None else meter.rate(now),
@@ -138,12 +141,33 @@ class AccessLayer:
             Nodes of the current cut: never dropped before the next call.
         """
         build = self._now
-        build.drop(build.residency.pin(np.asarray(pinned, dtype=np.int64)))
+        self._traffic.draws(build, np.asarray(pinned, dtype=np.int64))
         if self._traffic.stopped:
             return
         pages, nodes = build.missing(np.asarray(wants, dtype=np.int64))
         self._traffic.wanted.frame(self._clock(), pages, nodes)
         self._traffic.offer(build, pages, nodes[~build.busy[nodes]])
+
+    @property
+    def spare(self) -> bool:
+        """Whether all that is wanted is under way and the link has time for what may be wanted next (`prefetch`)."""
+        return self._traffic.spare
+
+    def prefetch(self, nodes: ArrayLike) -> None:
+        """Say what a later frame may want, in place of what was said before: asked for only where the link would idle.
+
+        It delays no want by more than one request of `SchedulerOptions.ahead_seconds` or one cloud, pushes no cloud out
+        of memory and is counted apart (`LayerStats.speculative_bytes`). What a store holds itself stays there.
+
+        Parameters
+        ----------
+        nodes : (n,) integers
+            Most urgent first; those that are not known yet stand for their page. Empty: nothing.
+        """
+        build = self._now
+        if not self._traffic.stopped:
+            pages, nodes = build.missing(np.asarray(nodes, dtype=np.int64))
+            self._traffic.offer_ahead(build, pages, nodes[~build.busy[nodes]])
 
     async def idle(self) -> None:
         """Wait until nothing is in flight and nothing is being decoded."""

@@ -53,8 +53,11 @@ class MatchReport:
         Largest distance of partners, model units.
     max_normal_error_degrees : float or None
         Largest angle of partners that both have a normal; None if normals were not compared.
+    max_color_error : int or None
+        Largest difference of a colour channel of partners; None if colours were not compared.
     differing : dict of str to int
-        Partners whose values differ, by attribute; for normals: one has a normal and the other none.
+        Partners whose values differ by more than the model allows, by attribute; for normals: one has a normal and the
+        other none.
     """
 
     samples_in: int = 0
@@ -63,6 +66,7 @@ class MatchReport:
     surplus: int = 0
     max_position_error: float = 0.0
     max_normal_error_degrees: float | None = None
+    max_color_error: int | None = None
     differing: dict[str, int] = field(default_factory=dict)
 
 
@@ -178,6 +182,10 @@ class Matcher:
                 angle, differing = _angles(a, b)
                 before = self.report.max_normal_error_degrees or 0.0
                 self.report.max_normal_error_degrees = max(before, angle)
+            elif attribute.kind == "color":
+                apart = np.abs(a.astype(np.int64) - b).max(axis=1, initial=0)
+                self.report.max_color_error = max(self.report.max_color_error or 0, int(apart.max(initial=0)))
+                differing = int((apart > attribute.max_error).sum())
             else:
                 differing = _differ(a, b)
             self.report.differing[attribute.name] += differing
@@ -218,7 +226,7 @@ def _differ(a: NDArray[Any], b: NDArray[Any]) -> int:
     different = a != b
     if a.dtype.kind == "f":
         different &= ~(np.isnan(a) & np.isnan(b))
-    return int((different.any(axis=1) if different.ndim > 1 else different).sum())
+    return int(different.sum())
 
 
 def _angles(a: NDArray[np.float32], b: NDArray[np.float32]) -> tuple[float, int]:

@@ -101,9 +101,21 @@ class Model:
         return self._reader.index
 
     @property
+    def complete(self) -> bool:
+        """Whether all of the file is there."""
+        return self._reader.complete
+
+    @property
     def info(self) -> dict[str, Any]:
-        """What ``pointstream info --json`` prints."""
-        return {**info_dict(self.header), "complete": self._reader.complete}
+        """What ``pointstream info --json`` prints; reads the index of a file that is cut short."""
+        facts = info_dict(self.header)
+        if not self._reader.complete:
+            nodes = self._loop.wait(self._reader.present())
+            facts |= {
+                "complete": False,
+                "here": {"samples": int(self.index.samples[nodes].sum()), "clouds": len(nodes)},
+            }
+        return facts
 
     @property
     def attributes(self) -> dict[str, np.dtype[Any]]:

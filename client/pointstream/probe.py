@@ -76,11 +76,8 @@ async def probe(
     StoreError
         If the address is none, or nobody answers there.
     """
-    options = options or ProbeOptions()
+    options, url = options or ProbeOptions(), parse_address(address)
     try:
-        url = httpx.URL(address)
-        if url.scheme not in ("http", "https") or not url.host:
-            raise StoreError(f"{address[:200]} is no http(s) address")
         async with (
             asyncio.timeout(options.total),
             httpx.AsyncClient(
@@ -88,11 +85,26 @@ async def probe(
             ) as client,
         ):
             return await _Probe(client, url, clock, options).run()
-    except httpx.InvalidURL as error:
-        raise StoreError(f"{address[:200]} is no address: {error}") from error
     except (httpx.HTTPError, TimeoutError) as error:
         said = str(error) or "nothing came in time"
         raise Unavailable(f"{url.host} does not answer as a web server should: {said}") from error
+
+
+def parse_address(address: str) -> httpx.URL:
+    """Take an http(s) address apart.
+
+    Raises
+    ------
+    StoreError
+        If it is none.
+    """
+    try:
+        url = httpx.URL(address)
+    except httpx.InvalidURL as error:
+        raise StoreError(f"{address[:200]} is no address: {error}") from error
+    if url.scheme not in ("http", "https") or not url.host:
+        raise StoreError(f"{address[:200]} is no http(s) address")
+    return url
 
 
 class _Probe:

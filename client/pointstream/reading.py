@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -177,6 +178,18 @@ class Reader:
             frontier = children[children >= 0].astype(np.int64)
         nodes = np.sort(np.concatenate(found))
         return nodes[self.reaches(index.offset[nodes], index.offset[nodes] + index.size[nodes])]
+
+    async def present(self) -> NDArray[np.int64]:
+        """Find all nodes that are there; those that only a damaged page leads to are not found.
+
+        Raises
+        ------
+        StoreError
+        """
+        with suppress(Corrupt):
+            await self.select()
+        index = self.index
+        return np.flatnonzero(index.known & self.reaches(index.offset, index.offset + index.size))
 
     async def load_pages(self, nodes: NDArray[np.int64]) -> None:
         """Read the pages of these nodes, as far as the file reaches.

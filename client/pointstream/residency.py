@@ -6,6 +6,9 @@ so that what stays is still a tree from the root down. Clouds of the current cut
 even if they alone pass the capacity; `over` then says by how much. `full` says that the cut leaves no room: asking
 for more would only push out what was just fetched, so the access layer then asks for nothing.
 
+A cloud that came *ahead*, before any frame wanted it, counts as older than all that was ever drawn until a frame draws
+it: the first to go, and nothing goes for it. `roomy` says whether there is room for more of them.
+
 Dropping goes on until a sixteenth of the capacity is free, so that its pass over the resident nodes is paid once per
 many arrivals. Nothing is done per node and frame in Python.
 """
@@ -18,6 +21,9 @@ import numpy as np
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+UNDRAWN = 1 << 62
+"""Taken from the time of what no frame has drawn: it is older than everything else, and keeps its order."""
 
 
 class Residency:
@@ -57,6 +63,11 @@ class Residency:
         """Whether the pinned clouds alone leave less than the slack."""
         return self._pinned_bytes > self.capacity - self.capacity // self._slack
 
+    @property
+    def roomy(self) -> bool:
+        """Whether what comes ahead finds room without pushing anything out: half of what is freed at a time."""
+        return self.bytes <= self.capacity - self.capacity // (2 * self._slack)
+
     def pin(self, nodes: NDArray[np.int64]) -> list[int]:
         """Make `nodes` the current cut: touched now, not to be dropped until the next call.
 
@@ -71,13 +82,16 @@ class Residency:
         self._pinned_bytes = int(self._sizes[self._pinned[self.resident[self._pinned]]].sum())
         return self._evict(newest=-1)
 
-    def add(self, node: int, size: int) -> list[int]:
-        """Take in a cloud of `size` bytes; return the nodes dropped for it (never itself)."""
+    def add(self, node: int, size: int, *, ahead: bool = False) -> list[int]:
+        """Take in a cloud of `size` bytes; return the nodes dropped for it: never itself, unless it came ahead."""
+        if ahead and self.bytes + size > self.capacity:
+            self.evicted += 1
+            return [node]
         self._tick += 1
         self.bytes += size - (int(self._sizes[node]) if self.resident[node] else 0)
         self.resident[node] = True
         self._sizes[node] = size
-        self._touched[node] = self._tick
+        self._touched[node] = self._tick - (UNDRAWN if ahead else 0)
         return self._evict(newest=node)
 
     def _evict(self, newest: int) -> list[int]:

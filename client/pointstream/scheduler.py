@@ -26,6 +26,11 @@ those allowed by the estimated network bandwidth, and forgetting the rest". A li
    doubles each round trip from one that suits the prior. Requests grow with it, since only so many fly at a time.
 7. *A local file has no link*: a constant window bounds what is in flight, and the layer stops asking while too much
    waits to be decoded.
+8. *What nobody wants yet fills an idle line only.* `offer_ahead` says what a later frame may want. It is asked for
+   when every want is in flight and less than a round trip of bytes is outstanding, one request at a time: the line
+   stays busy, and what a new want finds before it at the narrow place of the line is one such request at most,
+   ``rate * ahead_seconds`` bytes or one object. Window, bucket, slots and slow start of the wants do not count it:
+   which wants are asked for, and when, does not depend on it.
 
 Everything is an argument: wants, time, and the state of the link. `offer` and `issue` return and do no I/O.
 """
@@ -37,7 +42,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lpc.ranges import ByteRange
+from .offers import Item, Offer, Request
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -67,6 +72,12 @@ class SchedulerOptions:
         Bytes in flight, and the widest gap in a merged read, where there is no link.
     most_wants : int
         Wants that are looked at; the rest comes with a later frame.
+    ahead_seconds : float
+        Length of a request for what nobody wants yet, seconds of the link, unless one object is longer.
+    ahead_patience : float
+        Seconds of the link that such an object may take: longer ones are not fetched before they are wanted.
+    most_ahead : int
+        Such requests in flight, at most, besides `most_requests`.
     """
 
     request_seconds: float = 0.1
@@ -80,6 +91,9 @@ class SchedulerOptions:
     local_window: int = 1 << 20
     local_gap: int = 4096
     most_wants: int = 2048
+    ahead_seconds: float = 0.05
+    ahead_patience: float = 0.25
+    most_ahead: int = 4
 
 
 class LinkState(NamedTuple):
@@ -91,25 +105,6 @@ class LinkState(NamedTuple):
     """Seconds."""
     measured: bool
     """False: `rate` is a prior."""
-
-
-class Item(NamedTuple):
-    """A cloud or a page inside a request."""
-
-    key: int
-    start: int
-    stop: int
-
-
-@dataclass(slots=True, eq=False)
-class Request:
-    """One byte range in flight."""
-
-    range: ByteRange
-    items: tuple[Item, ...]
-    """In order of place in the file."""
-    landed: int = 0
-    """Bytes that have arrived."""
 
 
 class Scheduler:
@@ -126,10 +121,7 @@ class Scheduler:
         self._tokens = float("inf")  # a bucket starts full
         self._filled: float | None = None
         self._grown = 0
-        self._start: NDArray[np.int64] = np.empty(0, dtype=np.int64)
-        self._stop = self._key = self._by_rank = self._start
-        self._free: NDArray[np.bool_] = np.empty(0, dtype=bool)
-        self._cursor = 0
+        self._wants, self._ahead = Offer.nothing(), Offer.nothing()
 
     def __repr__(self) -> str:
         return f"<Scheduler {self.in_flight} requests, {self.outstanding} bytes outstanding, {self.waiting} wants>"
@@ -137,7 +129,7 @@ class Scheduler:
     @property
     def outstanding(self) -> int:
         """Bytes asked for and not here."""
-        return sum(request.range.size - request.landed for request in self._flying)
+        return sum(request.outstanding for request in self._flying)
 
     @property
     def in_flight(self) -> int:
@@ -147,7 +139,7 @@ class Scheduler:
     @property
     def waiting(self) -> int:
         """Wants of the last offer that are not in flight."""
-        return int(self._free.sum())
+        return self._wants.waiting
 
     def flies(self, key: int) -> bool:
         """Whether a key is in flight."""
@@ -161,16 +153,27 @@ class Scheduler:
         keys, starts, stops : ndarray, (n,) int64
             What is wanted, most urgent first, each once, and where it stands in the file. Keys in flight are skipped.
         """
-        flying = np.fromiter(self._keys, dtype=np.int64, count=len(self._keys))
-        new = np.flatnonzero(~np.isin(keys, flying))[: self.options.most_wants]
-        keys, starts, stops = keys[new], starts[new], stops[new]
-        place = np.argsort(starts, kind="stable")
-        self._key, self._start, self._stop = keys[place], starts[place], stops[place]
-        self._by_rank = np.argsort(place, kind="stable")
-        self._free = np.ones(len(place), dtype=bool)
-        self._cursor = 0
+        self._ahead.withdraw(keys)
+        new = self._not_flying(keys)[: self.options.most_wants]
+        self._wants = Offer(keys[new], starts[new], stops[new])
 
-    def issue(self, now: float, link: LinkState | None) -> list[Request]:
+    def offer_ahead(self, keys: NDArray[np.int64], starts: NDArray[np.int64], stops: NDArray[np.int64]) -> None:
+        """Replace what nobody wants yet and a later frame may want; it stays offered until this is called again.
+
+        Parameters
+        ----------
+        keys, starts, stops : ndarray, (n,) int64
+            As in `offer`. What is wanted already stays wanted.
+        """
+        new = self._not_flying(keys)[: self.options.most_wants]
+        new = new[~self._wants.holds(keys[new])]
+        self._ahead = Offer(keys[new], starts[new], stops[new])
+
+    def _not_flying(self, keys: NDArray[np.int64]) -> NDArray[np.intp]:
+        flying = np.fromiter(self._keys, dtype=np.int64, count=len(self._keys))
+        return np.flatnonzero(~np.isin(keys, flying))
+
+    def issue(self, now: float, link: LinkState | None, *, ahead: bool = True) -> list[Request]:
         """Take as many of the wants as may be asked for now.
 
         Parameters
@@ -179,24 +182,55 @@ class Scheduler:
             Seconds.
         link : LinkState or None
             None for a local file.
+        ahead : bool
+            Whether there is room for what nobody wants yet.
         """
         self._fill_bucket(now, link)
+        issued = self._issue_wanted(link)
+        if ahead and link is not None and not self.waiting:
+            issued += self._issue_ahead(link)
+        return issued
+
+    def _issue_wanted(self, link: LinkState | None) -> list[Request]:
         window, longest = self.window(link), self.longest(link)
         issued: list[Request] = []
-        outstanding = self.outstanding
-        while len(self._flying) < self.options.most_requests:
-            seed = self._next_seed()
+        flying = [request for request in self._flying if not request.ahead]
+        outstanding = sum(request.outstanding for request in flying)
+        while len(flying) + len(issued) < self.options.most_requests:
+            seed = self._wants.next_seed()
             if seed < 0:
                 break
-            first, last = self._grow(seed, self._widest_gap(link, outstanding), longest)
-            request = self._request(first, last)
+            first, last = self._wants.grow(seed, self._widest_gap(link, outstanding), longest)
+            request = self._wants.request(first, last)
             if outstanding > 0 and outstanding + request.range.size > window:
                 break
             if link is not None and link.measured:
                 if self._tokens <= 0:
                     break
                 self._tokens -= request.range.size
-            self._free[first : last + 1] = False
+            self._wants.take(first, last)
+            self.adopt(request)
+            issued.append(request)
+            outstanding += request.range.size
+        return issued
+
+    def _issue_ahead(self, link: LinkState) -> list[Request]:
+        """Rule 8."""
+        longest, patience = link.rate * self.options.ahead_seconds, link.rate * self.options.ahead_patience
+        issued: list[Request] = []
+        flying = sum(request.ahead for request in self._flying)
+        outstanding = self.outstanding
+        while flying + len(issued) < self.options.most_ahead and (
+            outstanding == 0 or outstanding < link.rate * link.rtt
+        ):
+            seed = self._ahead.next_seed()
+            if seed < 0:
+                break
+            first, last = self._ahead.grow(seed, self.options.overhead, int(longest))
+            request = self._ahead.request(first, last, ahead=True)
+            self._ahead.take(first, last)
+            if request.range.size > patience:
+                continue
             self.adopt(request)
             issued.append(request)
             outstanding += request.range.size
@@ -217,7 +251,8 @@ class Scheduler:
     def landed(self, request: Request, nbytes: int) -> None:
         """Note that more of a request has arrived (or, below 0, that a reply started again)."""
         request.landed = min(request.range.size, max(0, request.landed + nbytes))
-        self._grown += max(0, nbytes)
+        if not request.ahead:
+            self._grown += max(0, nbytes)
 
     def ended(self, request: Request) -> None:
         """Note that a request is over, whole or not; what it did not deliver may be wanted again."""
@@ -255,35 +290,3 @@ class Scheduler:
         if link is not None:
             capacity = float(self.window(link))
             self._tokens = min(capacity, self._tokens + passed * link.rate * self.options.gain)
-
-    def _next_seed(self) -> int:
-        """Place of the most urgent want that is still free, or -1."""
-        while self._cursor < len(self._by_rank):
-            place = int(self._by_rank[self._cursor])
-            if self._free[place]:
-                return place
-            self._cursor += 1
-        return -1
-
-    def _grow(self, seed: int, gap: int, longest: int) -> tuple[int, int]:
-        """First and last place of the request around a seed (rules 2 and 3)."""
-        first = last = seed
-        start, stop = int(self._start[seed]), int(self._stop[seed])
-        while last + 1 < len(self._free) and self._free[last + 1]:
-            near, far = int(self._start[last + 1]), int(self._stop[last + 1])
-            if near - stop > gap or far - start > longest:
-                break
-            last, stop = last + 1, far
-        while first > 0 and self._free[first - 1]:
-            near, far = int(self._stop[first - 1]), int(self._start[first - 1])
-            if start - near > gap or stop - far > longest:
-                break
-            first, start = first - 1, far
-        return first, last
-
-    def _request(self, first: int, last: int) -> Request:
-        items = tuple(
-            Item(int(self._key[place]), int(self._start[place]), int(self._stop[place]))
-            for place in range(first, last + 1)
-        )
-        return Request(ByteRange(items[0].start, items[-1].stop), items)

@@ -18,9 +18,11 @@ from lpc.ranges import ByteRange
 from .arrivals import Assembly
 from .build import Build
 from .decoding import Decoder
+from .foresight import Foresight
+from .offers import Item, Request
 from .opening import Opening, add_page, naming, vouch_opening
 from .recovery import Recovery
-from .scheduler import Item, LinkState, Request, Scheduler
+from .scheduler import LinkState, Scheduler
 from .stats import ErrorLog, ErrorReport
 from .wanted import Wanted
 
@@ -48,6 +50,7 @@ class Traffic:
         Of what comes over the link, and of what the store holds. Replaced together with the build.
     decoder : Decoder
     wanted : Wanted
+    foresight : Foresight
     errors : ErrorLog
     received, requests, payload : int
         Bytes that came, requests that brought any, bytes that were used.
@@ -62,6 +65,7 @@ class Traffic:
         self.scheduler, self.local = Scheduler(options.scheduler), Scheduler(options.scheduler)
         self.decoder = Decoder(options.decode_threads, clock)
         self.wanted = Wanted(clock())
+        self.foresight = Foresight()
         self.errors = ErrorLog()
         self.received = self.requests = self.payload = 0
         self.stopped = False
@@ -112,15 +116,32 @@ class Traffic:
         pages, nodes : (n,) int64
             Pages before nodes, each most urgent first.
         """
-        places = np.array([build.page_item(page) for page in pages.tolist()], dtype=np.int64).reshape(-1, 3)
-        start = build.index.offset[nodes]
-        keys = np.concatenate([places[:, 0], nodes])
-        starts = np.concatenate([places[:, 1], start])
-        stops = np.concatenate([places[:, 2], start + build.index.size[nodes]])
-        held = np.concatenate([self.store.holds(places[:, 1], places[:, 2]), build.held[nodes]])
+        keys, starts, stops, held = build.places(pages, nodes)
         self.local.offer(keys[held], starts[held], stops[held])
         self.scheduler.offer(keys[~held], starts[~held], stops[~held])
         self.issue()
+
+    def offer_ahead(self, build: Build, pages: NDArray[np.int64], nodes: NDArray[np.int64]) -> None:
+        """Replace what may be wanted later: asked for where the link would idle, and only over the link."""
+        keys, starts, stops, held = build.places(pages, nodes)
+        self.scheduler.offer_ahead(keys[~held], starts[~held], stops[~held])
+        self.issue()
+
+    @property
+    def spare(self) -> bool:
+        """Whether there is a link, with all that is wanted under way, and room for what comes ahead."""
+        return (
+            not (self.stopped or self._stale)
+            and self.store.meter is not None
+            and not self.scheduler.waiting
+            and self.build is not None
+            and self.build.residency.roomy
+        )
+
+    def draws(self, build: Build, nodes: NDArray[np.int64]) -> None:
+        """Keep what a frame draws until the next one."""
+        self.foresight.drew(nodes)
+        self.foresight.dropped(build.drop(build.residency.pin(nodes)))
 
     def issue(self) -> None:
         """Ask for what may be asked for now."""
@@ -141,7 +162,7 @@ class Traffic:
             return
         meter = self.store.meter
         link = None if meter is None else LinkState(meter.admission(now), meter.rtt, meter.measured)
-        for request in self.scheduler.issue(now, link):
+        for request in self.scheduler.issue(now, link, ahead=build.residency.roomy):
             self._spawn(self._fetch(build, request, self.scheduler))
 
     def _spawn(self, work: Coroutine[None, None, None]) -> None:
@@ -212,6 +233,7 @@ class Traffic:
         self.builds += 1
         self.build = Build(opening.index, capacity=self._options.capacity, store=self.store)
         self.wanted.begin(header.nodes)
+        self.foresight.begin(header.nodes, header.page_nodes)
         return self.build
 
     def _claim(self, build: Build, request: Request, assembly: Assembly, nodes: NDArray[np.int64]) -> None:
@@ -235,6 +257,7 @@ class Traffic:
             wanted = request.range
             if here := build.take_tail(wanted):
                 assembly.feed(wanted.start, here)
+                request.held = len(here)
                 wanted = ByteRange(wanted.start + len(here), wanted.stop)
             data = await self.store.read(wanted, sink)
             self._recovery.answered()
@@ -250,6 +273,8 @@ class Traffic:
         if request.landed == 0:
             self.requests += 1
         self.received += len(chunk)
+        if request.ahead:
+            self.foresight.landed(len(chunk), wanting=self.wanted.anything)
         scheduler.landed(request, assembly.feed(offset, chunk))
 
     def _arrive(self, build: Build, request: Request, assembly: Assembly) -> None:
@@ -263,7 +288,7 @@ class Traffic:
                 self._page_arrived(build, ~item.key, data, request, assembly)
             elif not build.residency.resident[item.key] and not build.busy[item.key]:
                 build.busy[item.key] = True
-                done = partial(self._decoded, build, item, data)
+                done = partial(self._decoded, build, item, data, ahead=request.brings(item) if request.ahead else 0)
                 self.decoder.decode(data, node=item.key, index=build.index, done=done)
         if arrived:
             self.issue()
@@ -279,13 +304,15 @@ class Traffic:
             return
         self.payload += len(data) * build.passed(build.page_item(page), data)
         build.page_came(page)
+        if request.ahead:
+            self.foresight.came(~page, request.brings(build.page_item(page)))
         self.wanted.came(self._clock(), ~page)
         if request.range.start == 0:  # the probe: what else the new page shows to lie inside it
             first = page * build.index.header.page_nodes
             nodes = np.arange(first, min(first + build.index.header.page_nodes, len(build.index)))
             self._claim(build, request, assembly, nodes)
 
-    def _decoded(self, build: Build, item: Item, data: bytes, cloud: Cloud | Corrupt) -> None:
+    def _decoded(self, build: Build, item: Item, data: bytes, cloud: Cloud | Corrupt, *, ahead: int) -> None:
         build.busy[item.key] = False
         self._settle()
         if build is not self.build:
@@ -294,7 +321,10 @@ class Traffic:
             self._damaged(build, item.key, cloud)
         else:
             self.payload += len(data) * build.passed(item, data)
-            build.add(item.key, cloud)
+            if ahead:
+                self.foresight.came(item.key, ahead)
+            undrawn = ahead > 0 and not self.wanted.holds(item.key)
+            self.foresight.dropped(build.add(item.key, cloud, ahead=undrawn))
             self.wanted.came(self._clock(), item.key)
         self.issue()
 

@@ -98,6 +98,7 @@ class VerifyReport:
                 "surplus": match.surplus,
                 "max_position_error": match.max_position_error,
                 "max_normal_error_degrees": match.max_normal_error_degrees,
+                "max_color_error": match.max_color_error,
                 "attributes_differing": dict(match.differing),
             }
         return entry
@@ -272,5 +273,7 @@ def _match(matcher: Matcher, scans: Sequence[Scan], header: Header, problems: _P
         problems.add(f"a normal is {worst:.3f} degrees off, more than the bound {max_error_degrees(bits):.3f}")
     for name, count in match.differing.items():
         if count:
-            problems.add(f"{name} differs in {count} samples")
+            allowed = next(item.max_error for item in header.attributes if item.name == name)
+            beyond = f" by more than the {allowed} that are allowed" if allowed else ""
+            problems.add(f"{name} differs in {count} samples{beyond}")
     return match

@@ -48,6 +48,10 @@ class Wanted:
             self._count -= 1
         self._note(now)
 
+    def holds(self, key: int) -> bool:
+        """Whether the last frame wanted a cloud (or page ``~key``) that is not here."""
+        return ~key in self._pages if key < 0 else bool(self._nodes[key])
+
     def stop(self, now: float) -> None:
         """Note that nothing can be had any more."""
         self._nodes[:] = False

@@ -120,7 +120,7 @@ def _limits(index: IndexTree, camera: Camera, nodes: Nodes) -> NDArray[np.float6
     offset = index.center[nodes] - np.array(camera.eye)
     gap = np.sqrt(np.einsum("ij,ij->i", offset, offset)) - index.radius[nodes]
     spacing_px = np.full(len(nodes), math.inf)
-    np.divide(index.spacing[nodes] * camera.focal, gap, out=spacing_px, where=gap > 0)
+    np.divide(index.density.coarseness[nodes] * camera.focal, gap, out=spacing_px, where=gap > 0)
     limit = np.full(len(nodes), math.inf)
     above = np.searchsorted(nodes, index.parent[nodes])
     starts = np.flatnonzero(np.diff(index.level[nodes])) + 1  # nodes ascend, and so do their levels

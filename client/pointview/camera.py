@@ -99,9 +99,11 @@ class Camera:
         return {"eye": list(self.eye), "target": list(self.target), "up": list(self.up), "fov_y": self.fov_y}
 
     @classmethod
-    def frame_model(cls, header: Header, *, width: int, height: int, fov_y: float = FOV_Y) -> Camera:
-        """Frame a whole model: along -y with z up where it is georeferenced, along -z with y up otherwise."""
-        if header.crs is not None:
+    def frame_model(
+        cls, header: Header, *, width: int, height: int, fov_y: float = FOV_Y, z_up: bool | None = None
+    ) -> Camera:
+        """Frame a whole model: along -y with z up, along -z with y up; z is up where it is georeferenced."""
+        if header.crs is not None if z_up is None else z_up:
             backward, up = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
         else:
             backward, up = (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 LARGEST_SIDE = 16384
 MOST_THREADS = 8
 MOST_PICTURES = 100_000
+MOST_ANTIALIAS = 8
 
 
 class SizeType(click.ParamType[tuple[int, int]]):
@@ -107,6 +108,20 @@ TOLERANCE = click.option(
 @TOLERANCE
 @click.option("--budget", type=COUNT, help="Most splats; coarser where the tolerance needs more.")
 @click.option("--backend", type=click.Choice(["auto", "gl", "cpu"]), default="auto", show_default=True)
+@click.option(
+    "--splat",
+    type=click.Choice(["square", "round", "disc", "blended"]),
+    default="disc",
+    show_default=True,
+    help="What samples look like; blended shows the mean of them.",
+)
+@click.option(
+    "--antialias",
+    type=click.IntRange(min=1, max=MOST_ANTIALIAS),
+    default=1,
+    show_default=True,
+    help="Draw so many times wider and higher, and show the mean.",
+)
 @click.option("--two-sided", is_flag=True, help="Show surfaces from behind too: for normals that may point inward.")
 @click.option("--path", type=click.Path(path_type=Path, dir_okay=False), help="PATH.json: a picture at each time.")
 @click.option("--turntable", type=click.IntRange(min=2, max=MOST_PICTURES), help="So many pictures around the model.")
@@ -134,6 +149,8 @@ def render(
     tolerance: float,
     budget: int | None,
     backend: Any,
+    splat: Any,
+    antialias: int,
     two_sided: bool,
     path: Path | None,
     turntable: int | None,
@@ -154,6 +171,8 @@ def render(
     if out.suffix.lower() not in FORMATS and (out.suffix or not many):
         raise click.UsageError(f"{out}: the suffix says the format; use one of {', '.join(FORMATS)}")
     width, height = size
+    if max(size) * antialias > LARGEST_SIDE:
+        raise click.UsageError(f"{width}x{height} with --antialias {antialias} is above {LARGEST_SIDE} pixels a side")
     options = StillOptions(
         width=width,
         height=height,
@@ -162,7 +181,8 @@ def render(
         budget=budget,
         backend=backend,
         threads=min(os.cpu_count() or 1, MOST_THREADS),
-        style=Style(two_sided=two_sided),
+        style=Style(two_sided=two_sided, splat=splat),
+        antialias=antialias,
     )
     if many:
         if path is not None and (view is not None or turntable is not None):

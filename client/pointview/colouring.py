@@ -116,16 +116,23 @@ class Colouring:
         The root's cloud: a uniform sample of the whole model, whose values span the ramp of an intensity.
     index : IndexTree
         Tells the levels of nodes.
+    up : {0, 1, 2}, optional
+        The axis of heights; z where the model is georeferenced, else y.
 
     Attributes
     ----------
     header : Header
         What a renderer is opened with.
     legend : Legend or None
+        Names the classes of the clouds that were coloured so far.
     """
 
-    def __init__(self, mode: Mode, header: Header, index: IndexTree, root: Cloud | None) -> None:
+    def __init__(
+        self, mode: Mode, header: Header, index: IndexTree, root: Cloud | None, *, up: int | None = None
+    ) -> None:
         self.mode = mode
+        self._up = (2 if header.crs is not None else 1) if up is None else up
+        self._classes = np.zeros(256, dtype=bool)
         self.legend: Legend | None = None
         self.header = header
         self._index, self._model = index, header
@@ -162,7 +169,9 @@ class Colouring:
             return np.rint(decode_normals(codes, attribute.bits) * 127.0 + 128.0).astype(np.uint8)
         values = attribute.decode(codes)
         if self.mode == "classification":
-            return self._table[np.clip(values, 0, 255).astype(np.uint8)]
+            numbers = np.clip(values, 0, 255).astype(np.uint8)
+            self._note(numbers)
+            return self._table[numbers]
         return self._ramped(values.astype(np.float64))
 
     def _prepare(self, root: Cloud | None) -> None:
@@ -170,16 +179,17 @@ class Colouring:
         if self.mode == "level":
             self._table = np.array(WHEEL, dtype=np.uint8)
             levels = range(min(self._model.levels, len(WHEEL)))
-            names = [f"{level}, {level + len(WHEEL)}, ..." for level in levels]
-            self.legend = Legend(title="level", entries=tuple(zip(names, WHEEL, strict=False)))
+            names = [", ".join(map(str, range(level, self._model.levels, len(WHEEL)))) for level in levels]
+            self.legend = Legend(title="level of the tree", entries=tuple(zip(names, WHEEL, strict=False)))
         elif self.mode == "height":
-            axis = self._axis()
+            axis = self._up
             self._low, self._high = self._model.bounds[axis], self._model.bounds[axis + 3]
             self.legend = Legend(title=f"height ({'xyz'[axis]})", ramp=self._table, low=self._low, high=self._high)
         elif self.mode == "classification":
             self._table = class_table()
-            here = {} if root is None or self._attribute is None else self._classes(root)
-            self.legend = Legend(title="classification", entries=tuple(here.values()))
+            self.legend = Legend(title="classification")
+            if root is not None:
+                self.colors(0, root)
         elif self.mode == "intensity" and self._attribute is not None:
             if root is not None and len(root):
                 values = self._attribute.decode(root.codes[self._attribute.name]).astype(np.float64)
@@ -189,17 +199,18 @@ class Colouring:
             shares = (("+x", (255, 128, 128)), ("+y", (128, 255, 128)), ("+z", (128, 128, 255)))
             self.legend = Legend(title="normal", entries=shares)
 
-    def _classes(self, root: Cloud) -> dict[int, tuple[str, Rgb]]:
-        assert self._attribute is not None
-        numbers = np.unique(self._attribute.decode(root.codes[self._attribute.name])).astype(np.int64).tolist()
-        named = {number: CLASSES.get(number, ("", (0, 0, 0)))[0] for number in numbers if 0 <= number < 256}
-        return {number: (f"{number} {name}".strip(), _rgb(self._table[number])) for number, name in named.items()}
-
-    def _axis(self) -> int:
-        return 2 if self._model.crs is not None else 1
+    def _note(self, numbers: NDArray[np.uint8]) -> None:
+        """Name the classes of a cloud in the legend."""
+        here = np.bincount(numbers, minlength=256) > 0
+        if (here <= self._classes).all():
+            return
+        self._classes |= here
+        found = np.flatnonzero(self._classes).tolist()
+        entries = tuple((f"{number} {class_name(number)}", _rgb(self._table[number])) for number in found)
+        self.legend = Legend(title="classification", entries=entries)
 
     def _heights(self, cloud: Cloud) -> NDArray[np.float64]:
-        axis = self._axis()
+        axis = self._up
         lattice = (cloud.position[:, axis].astype(np.int64) << cloud.shift) + cloud.origin[axis]
         return self._model.origin[axis] + self._model.step * lattice
 
@@ -217,6 +228,11 @@ def ramp() -> NDArray[np.uint8]:
     at = np.linspace(0, len(stops) - 1, 256)
     channels = [np.interp(at, np.arange(len(stops)), stops[:, channel]) for channel in range(3)]
     return np.rint(np.stack(channels, axis=1)).astype(np.uint8)
+
+
+def class_name(number: int) -> str:
+    """Name of a class; LAS leaves 64 to 255 to its users."""
+    return CLASSES[number][0] if number in CLASSES else "reserved" if number < 64 else "user defined"
 
 
 def class_table() -> NDArray[np.uint8]:

@@ -14,7 +14,8 @@ Samples of ancestors answer only for what is larger than their spacing. A node i
 parent's samples are at most `PROBE` pixels apart, and it stays a few tests longer than it is seen. One whose parent was
 not drawn in the last test is not hidden: what is known of it is old.
 
-The tests cost a share of each frame. Where they hide few nodes they are paused, and `Occlusion.verdict` says so.
+The tests cost a share of each frame. Where they hide few nodes they are paused, and `Occlusion.verdict` says so. A
+coarse picture tells little of a fine one, so a cut that has doubled since is tried again at once.
 """
 
 from __future__ import annotations
@@ -49,6 +50,9 @@ TRIAL = 4
 PAUSE = 60
 """Tests left out then, before the next trial."""
 
+GROWN = 2
+"""Nodes drawn, over those when that was decided, that make a trial worth it at once."""
+
 
 class Occlusion:
     """What earlier frames of one view of one model told about hidden nodes.
@@ -75,7 +79,7 @@ class Occlusion:
         self._camera: Camera | None = None
         self._back = np.zeros(nodes, dtype=bool)
         self._trial, self._pause = 0, 0
-        self._share = 0.0
+        self._share, self._judged = 0.0, 0
 
     @property
     def verdict(self) -> str | None:
@@ -84,23 +88,25 @@ class Occlusion:
             return None
         return f"occlusion culling is paused: {100 * self._share:.0f}% of the nodes are hidden, it would cost more"
 
-    def look(self, index: IndexTree, cut: Cut, camera: Camera, frame: Frame) -> int:
+    def look(self, index: IndexTree, cut: Cut, camera: Camera, frame: Frame, *, stride: int = 1) -> int:
         """Learn from the picture of a cut; return how many nodes that were hidden are seen now.
 
         Parameters
         ----------
         cut : Cut
             Refined with `hidden` as it is now, by the rule "place".
+        stride : int
+            Look at every so many pixels of every so many lines.
         """
         if self._pause > 0:
-            self._pause -= 1
+            self._pause = 0 if len(cut.nodes) >= GROWN * self._judged else self._pause - 1
             return 0
         if cut.places is None or not len(cut.nodes):
             return 0
         self._test += 1
         children = index.children[cut.nodes]
         fine = self._fine(index, cut, camera)
-        counts = pixels_by_cell(frame.depth, cut, camera)
+        counts = pixels_by_cell(frame.depth, cut, camera, stride=stride)
         tested = (children >= 0) & fine[:, None]
         seen = children[(children >= 0) & (counts > 0)]
         self._tested[children[tested]] = self._test
@@ -116,19 +122,19 @@ class Occlusion:
         self._back[seen[before[seen]]] = True
         now &= ~self._back
         self.hidden = now
-        self._judge(len(nodes), int(np.count_nonzero(now)))
+        self._judge(len(cut.nodes), len(nodes), int(np.count_nonzero(now)))
         return int(np.count_nonzero(before[seen]))
 
     def _fine(self, index: IndexTree, cut: Cut, camera: Camera) -> NDArray[np.bool_]:
         """Nodes whose samples are near enough to each other to tell what is hidden, and wholly in front of the eye."""
         offset = index.center[cut.nodes] - np.array(camera.eye)
         gap = np.sqrt(np.einsum("ij,ij->i", offset, offset)) - index.radius[cut.nodes]
-        return np.asarray(index.spacing[cut.nodes] * camera.focal < PROBE * gap)
+        return np.asarray(index.density.coarseness[cut.nodes] * camera.focal < PROBE * gap)
 
-    def _judge(self, tested: int, hidden: int) -> None:
+    def _judge(self, drawn: int, tested: int, hidden: int) -> None:
         """Pause where the tests hide too little."""
         self._trial += 1
         self._share = hidden / tested if tested else 0.0
         if self._trial >= TRIAL + self._kept and tested and self._share < WORTH:
-            self._trial, self._pause = 0, PAUSE
+            self._trial, self._pause, self._judged = 0, PAUSE, drawn
             self.hidden = np.zeros_like(self.hidden)

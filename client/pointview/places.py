@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
     from lpc.header import Header
 
+    from .uneven import Below
+
 MOST_HALVINGS = 48
 """Of one axis; a build tells no samples apart beyond."""
 
@@ -34,9 +36,10 @@ class Places:
 
     Parameters
     ----------
-    link : (n, 2) int32
-        Row of the drawn node in the lower and upper half of the cell of each drawn node, -1 where that half ends here.
-    spacing : (n, 2) float32
+    link : (n + m, 2) int32
+        Row of the lower and upper half of the cell of each drawn node, -1 where that half ends here. The first n rows
+        are those of the drawn nodes, the others those of cells below them (`uneven`).
+    spacing : (n + m, 2) float32
         Spacing to close in each half, model units; the largest of it where a link goes deeper. Negative in a half
         that ends here because its node is missing.
     corner : (n, 3) float64
@@ -84,6 +87,7 @@ def places(
     missing: Sequence[NDArray[np.bool_]],
     own: Sequence[NDArray[np.float64]],
     shown: Sequence[NDArray[np.float64]],
+    below: Below,
 ) -> Places:
     """Lay out the drawn nodes, level by level.
 
@@ -93,16 +97,20 @@ def places(
         For each node of a level, which children are drawn and which are missing.
     own, shown : sequence of (n,) float64
         Each node's own spacing and the largest shown around its samples.
+    below : Below
+        What the index says of the halves without a drawn node.
     """
-    axes, halves = halvings(header, len(drawn))
+    axes, halves = halvings(header, len(drawn) + below.levels)
     corner = np.array([header.bounds[:3]], dtype=np.float64)
     links, spacings, corners, levels, row = [], [], [], [], 0
     for depth, (goes_on, ends) in enumerate(zip(drawn, missing, strict=True)):
+        here = slice(row, row + len(goes_on))
         row += len(goes_on)
         children = int(np.count_nonzero(goes_on))
-        link = np.full(goes_on.shape, -1, dtype=np.int32)
+        link = below.link[here].copy()
         link[goes_on] = np.arange(row, row + children)
         spacing = np.where(ends, -own[depth][:, None], shown[depth][:, None])
+        spacing = np.where(np.isnan(below.spacing[here]), spacing, below.spacing[here])
         if children:
             spacing[goes_on] = shown[depth + 1]
         uniform = (link < 0).all(axis=1) & (spacing[:, 0] == spacing[:, 1])
@@ -110,12 +118,12 @@ def places(
         spacings.append(spacing)
         corners.append(corner)
         levels.append(np.where(uniform, -1, depth))
-        below = np.repeat(corner, 2, axis=0).reshape(-1, 2, 3)
-        below[:, 1, axes[depth]] += halves[depth]
-        corner = below[goes_on]
+        lower = np.repeat(corner, 2, axis=0).reshape(-1, 2, 3)
+        lower[:, 1, axes[depth]] += halves[depth]
+        corner = lower[goes_on]
     return Places(
-        link=np.concatenate(links),
-        spacing=np.concatenate(spacings).astype(np.float32),
+        link=np.concatenate([*links, below.link[row:]]),
+        spacing=np.concatenate([*spacings, below.spacing[row:]]).astype(np.float32),
         corner=np.concatenate(corners),
         level=np.concatenate(levels).astype(np.int32),
         axis=axes,

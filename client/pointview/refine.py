@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from .places import Places, places
 from .splats import CLOSING, LARGEST
+from .uneven import look_below
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -161,7 +162,7 @@ class _Sieve:
             visible &= ~away
         visible &= self.uncovered(nodes, visible)
         spacing_px = np.full(len(nodes), np.inf)
-        np.divide(index.spacing[nodes] * self.focal, gap, out=spacing_px, where=outside)
+        np.divide(index.density.coarseness[nodes] * self.focal, gap, out=spacing_px, where=outside)
         return visible, spacing_px
 
     def uncovered(self, nodes: Nodes, among: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -242,23 +243,25 @@ def refine(
         return _empty(wants=[], pages=[], culled=_culled(sieve))
 
     own = [index.spacing[level.nodes] for level in levels]
-    shown = _shown_spacing(levels, own)
     nodes = np.concatenate([level.nodes for level in levels])
     spacing_px = np.concatenate([level.spacing_px for level in levels])
     starved = np.concatenate([level.missing.any(axis=1) for level in levels])
     ends = starved | np.concatenate([(level.children < 0).all(axis=1) for level in levels])
+    coarseness = index.density.coarseness[nodes]
     if splat_rule == "paper":
-        spacing = np.concatenate(own) * np.where(ends, 1.0, np.minimum(tolerance / spacing_px, 1.0))
+        plain = np.concatenate(own)
+        spacing = np.where(ends, plain, np.minimum(coarseness * (tolerance / spacing_px), plain))
         laid_out = None
     else:
+        drawn, missing = [level.drawn for level in levels], [level.missing for level in levels]
+        below = look_below(index, camera, nodes, np.concatenate(drawn), np.concatenate(missing))
+        shown = _shown_spacing(levels, own, below.spacing)
         spacing = np.concatenate(shown)
-        laid_out = places(
-            index.header, [level.drawn for level in levels], [level.missing for level in levels], own, shown
-        )
+        laid_out = places(index.header, drawn, missing, own, shown, below)
     # A splat at the nearest point of the sphere; without bound but the largest where the eye is inside it.
     splat_px = np.ones(len(nodes))
     grown = spacing > 0
-    splat_px[grown] = CLOSING * spacing_px[grown] * (spacing[grown] / index.spacing[nodes[grown]])
+    splat_px[grown] = CLOSING * spacing_px[grown] * (spacing[grown] / coarseness[grown])
     wants, pages = _missing(index, camera, tolerance, levels, priority)
     ahead = _ahead(replace(sieve), tolerance, levels, resident) if 0 < len(wants) <= FEW else wants[:0]
     return Cut(
@@ -277,17 +280,30 @@ def refine(
     )
 
 
-def _shown_spacing(levels: list[_Level], spacings: list[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
-    """Largest spacing of the drawn regions around each node's samples, bottom up, model units."""
+def _shown_spacing(
+    levels: list[_Level], spacings: list[NDArray[np.float64]], ends: NDArray[np.float64]
+) -> list[NDArray[np.float64]]:
+    """Largest spacing of the drawn regions around each node's samples, bottom up, model units.
+
+    Parameters
+    ----------
+    ends : (n, 2) float64
+        What the index says of the halves without a drawn node (`Below.spacing`).
+    """
     shown: list[NDArray[np.float64]] = []
     below: NDArray[np.float64] = np.empty(0)
+    stop = sum(map(len, spacings))
     for level, own in zip(reversed(levels), reversed(spacings), strict=True):
+        start = stop - len(own)
+        thin = np.abs(ends[start:stop])
+        stop = start
         largest = np.zeros(level.drawn.shape)
         largest[level.drawn] = below
         largest = largest.max(axis=1)
         # A refined node all of whose children are culled keeps stray samples at the rim: 0, the smallest splat.
         refined = (level.children >= 0).any(axis=1) & ~level.missing.any(axis=1)
-        below = np.where(refined, np.minimum(largest, own), own)
+        # Parts of an uneven cell are coarser than the whole, drawn or not.
+        below = np.fmax(np.where(refined, largest, np.maximum(largest, own)), np.fmax(thin[:, 0], thin[:, 1]))
         shown.append(below)
     return shown[::-1]
 

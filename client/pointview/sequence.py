@@ -19,7 +19,7 @@ from pointstream.layer import AccessLayer, LayerOptions
 from pointstream.stores import open_store
 
 from .camera import Camera
-from .render import open_backend
+from .render import antialias, open_backend
 from .render.picture import save_picture
 from .settle import settle
 from .still import CAPACITY, StillOptions, camera_of, cut_of
@@ -152,7 +152,8 @@ async def draw_sequence(
                 look = partial(cut_of, options=one)
                 cut = await settle(layer, look, clock=time.monotonic, patience=options.patience)
                 start = time.perf_counter()
-                frame = backend.draw(cut, layer.take, camera_of(layer, one), options.style)
+                camera = camera_of(layer, one)
+                frame = antialias.draw(backend, cut, layer.take, camera, options.style, finer=options.antialias)
                 drawing += time.perf_counter() - start
                 most = max(most, frame.splats)
                 save_picture(frame.rgb, file)
@@ -198,8 +199,8 @@ def find_encoder(asked: str) -> str | None:
     if asked == "auto":
         return next(name for name in ANIMATIONS if can[name]())
     if not can[asked]():
-        needs = "imageio-ffmpeg" if asked == "mp4" else f"a Pillow with {asked}"
-        raise Unavailable(f"{asked} needs {needs}, which is not installed; use --animation gif")
+        needs = "imageio-ffmpeg (pip install 'pointstream[film]')" if asked == "mp4" else f"a Pillow with {asked}"
+        raise Unavailable(f"{asked} needs {needs}, which is not installed here; use --animation gif")
     return asked
 
 
@@ -234,17 +235,22 @@ def _write_pillow(files: Sequence[Path], out: Path, encoder: str, fps: float) ->
 def _write_mp4(files: Sequence[Path], out: Path, fps: float) -> None:
     import imageio_ffmpeg
 
-    writer = None
-    for file in files:
-        rgb = np.asarray(_loaded(file).convert("RGB"))
-        rgb = np.ascontiguousarray(rgb[: rgb.shape[0] // 2 * 2, : rgb.shape[1] // 2 * 2])  # H.264 halves the colours
-        if writer is None:
-            size = (rgb.shape[1], rgb.shape[0])
-            writer = imageio_ffmpeg.write_frames(str(out), size, fps=fps, quality=7, macro_block_size=2)
-            writer.send(None)
-        writer.send(rgb)
-    if writer is not None:
+    width, height = _loaded(files[0]).size
+    odd = ((0, height % 2), (0, width % 2), (0, 0))  # H.264 halves the colours: an odd side gets its last line twice
+    size = (width + odd[1][1], height + odd[0][1])
+    options: dict[str, Any] = {"fps": fps, "quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}
+    out.unlink(missing_ok=True)
+    writer = imageio_ffmpeg.write_frames(str(out), size, **options)
+    writer.send(None)
+    try:
+        for file in files:
+            writer.send(np.pad(np.asarray(_loaded(file).convert("RGB")), odd, mode="edge"))
+    except OSError as error:  # its text is a page of ffmpeg's
+        raise StoreError(f"cannot write {out}: ffmpeg stopped; use --animation webp") from error
+    finally:
         writer.close()
+    if not out.exists() or not out.stat().st_size:  # ffmpeg may stop after it took the last picture
+        raise StoreError(f"cannot write {out}: ffmpeg made no film of it; use --animation webp")
 
 
 def _loaded(file: Path) -> Image.Image:

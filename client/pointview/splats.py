@@ -6,10 +6,10 @@ larger than need be. Splats here have an area of `CLOSING^2 r^2`: 0.5%, in gaps 
 closed in the picture (`HOLE`). What remains is 0.02% of a closed surface, and silhouettes grow by a third of the
 spacing.
 
-A splat is a square of pixels where it covers only a few. A larger one is a disc: in the tangent plane of its sample
-where there is a normal, which keeps silhouettes thin and depths right; else facing the eye. Discs overlap by far, and a
-*bulge* decides between them: the depth grows with the square of the distance from the centre, so the nearest sample
-is seen, each in a cell of its own.
+A splat is one pixel where it is no larger. A larger one is a disc: in the tangent plane of its sample where there is a
+normal or its neighbours make one (`render.planes`), which keeps silhouettes thin and depths right; else facing the
+eye. Discs overlap by far, and a *bulge* decides between them: the depth grows with the square of the
+distance from the centre, so the nearest sample is seen, each in a cell of its own.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ CLOSING = 2.3
 ROUND = 2.0 / math.sqrt(math.pi)
 """Diameter of a disc over the side of the square of the same area."""
 
-ROUND_FROM = 2.0
-"""Splats with a side above this many pixels are discs; below, a square and a disc cover the same few pixels."""
+ROUND_FROM = 1.0
+"""Splats with a side above this many pixels are discs; below, a splat is the pixel that its sample falls into."""
 
 BULGE = 0.5
 """How far behind its centre the rim of a disc is, over its radius. Decides which is seen; the depth of a picture
@@ -48,3 +48,20 @@ LARGEST_HOLE = 64
 
 WALLS = 7
 """Directions, of eight, in which a nearer surface must stand around a hole: fewer would round off corners."""
+
+KERNEL = 0.22
+"""Standard deviation of a blended sample's Gaussian in its plane, sides of its splat: half the spacing."""
+
+PIXEL = 0.3
+"""That of a pixel's filter in blended pictures, pixels: as wide as the box of the pixel, whose variance is 1/12."""
+
+KERNEL_ENDS = 2.6
+"""Where both end, standard deviations: at the rim of the disc, so that samples reach every pixel of it, and beyond the
+corners of a pixel, so that every sample reaches one."""
+
+BEHIND = 1.0
+"""How far behind the surface that is seen a blended sample still belongs to it, measured across the surface: radii of
+its kernel, or pixels where these are larger."""
+
+SLANTED = 0.3
+"""Least cosine between plane and ray that this allows for: a plane seen more from the side may be a wrong one."""

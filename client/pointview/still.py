@@ -13,7 +13,7 @@ from pointstream.stores import open_store
 from .budget import allowance, refine_within
 from .camera import Camera
 from .refine import Cut, refine
-from .render import Backend, Frame, Kind, Style, open_backend
+from .render import Backend, Frame, Kind, Style, antialias, open_backend
 from .settle import settle
 from .unveil import unveil
 
@@ -47,6 +47,8 @@ class StillOptions:
     threads : int
         Threads of the CPU backend.
     style : Style
+    antialias : int
+        Samples a pixel, along each side of it.
     occlusion : bool
         Leave out what is hidden, where that pays; not with a budget, which counts what is in view.
     patience : float
@@ -61,6 +63,7 @@ class StillOptions:
     backend: Kind = "auto"
     threads: int = 1
     style: Style = field(default_factory=Style)
+    antialias: int = 1
     occlusion: bool = True
     patience: float = 60.0
 
@@ -108,10 +111,11 @@ async def draw_still(
         try:
             look, cut = await _settle(layer, options, backend, progress)
             camera = camera_of(layer, options)
-            backend.draw(cut, layer.take, camera, options.style)  # uploads, and compiles at the first use
+            draw = partial(antialias.draw, backend, cut, layer.take, camera, options.style, finer=options.antialias)
+            draw()  # uploads, and compiles at the first use
             start = time.perf_counter()
             look(layer)
-            frame = backend.draw(cut, layer.take, camera, options.style)
+            frame = draw()
             frame_ms = 1e3 * (time.perf_counter() - start)
         finally:
             backend.close()

@@ -39,6 +39,9 @@ class Attribute:
     scale : int
         Colours and integer scalars: value = code * scale (+ offset). 16-bit colours that only ever hold
         v * 256 or v * 257 are kept as 8-bit codes with that scale.
+    depth : int
+        Colours that are stored with fewer bits than they came with: how many those were, above `bits`. Codes are evenly
+        spread over the ``2**depth`` levels, both ends included. 0: values are stored as they came.
     """
 
     name: str
@@ -47,6 +50,7 @@ class Attribute:
     bits: int
     offset: int = 0
     scale: int = 1
+    depth: int = 0
 
     def __post_init__(self) -> None:
         if not (0 < len(self.name) <= MAX_NAME):
@@ -58,6 +62,8 @@ class Attribute:
             raise Corrupt(f"attribute {self.name}: {self.bits} bits ({least} to {most} are allowed)")
         if self.scale < 1:
             raise Corrupt(f"attribute {self.name}: scale {self.scale} is not positive")
+        if self.depth and not (self.kind == "color" and self.bits < self.depth <= most):
+            raise Corrupt(f"attribute {self.name}: a depth of {self.depth} bits, and {self.bits} are stored")
         try:
             item = np.dtype(self.dtype)
         except (TypeError, ValueError, SyntaxError) as error:  # numpy evaluates what looks like a list of fields
@@ -78,8 +84,16 @@ class Attribute:
                 return np.dtype(dtype)
         return np.dtype(np.uint64)
 
+    @property
+    def max_error(self) -> int:
+        """No decoded value of a colour or scalar is further than this from what was encoded; 0: they are equal."""
+        if not self.depth:
+            return 0
+        spacing = -(-((1 << self.depth) - 1) // ((1 << self.bits) - 1))
+        return spacing // 2 * self.scale
+
     def encode(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Codes of colour or scalar values; exact, see `decode`.
+        """Codes of colour or scalar values; exact but for `max_error`, see `decode`.
 
         Parameters
         ----------
@@ -99,23 +113,36 @@ class Attribute:
             return np.where(bits & top, ~bits, bits | top).astype(self.code_dtype)
         wide = np.ascontiguousarray(values, dtype=item).astype(np.uint64)  # two's complement wraps, and wraps back
         wide -= np.uint64(self.offset % (1 << 64))
-        return (wide // np.uint64(self.scale)).astype(self.code_dtype)
+        wide //= np.uint64(self.scale)
+        if self.depth:
+            levels, top = np.uint64((1 << self.bits) - 1), np.uint64((1 << self.depth) - 1)
+            wide = (wide * levels + top // np.uint64(2)) // top
+        return wide.astype(self.code_dtype)
 
     def decode(self, codes: NDArray[Any]) -> NDArray[Any]:
-        """Values of colour or scalar codes: the inverse of `encode`."""
+        """Values of colour or scalar codes: the inverse of `encode`, within `max_error`."""
         item = np.dtype(self.dtype)
         if item.kind == "f":
             unsigned = np.dtype(f"<u{item.itemsize}")
             bits = codes.astype(unsigned)
             top = unsigned.type(1 << (8 * item.itemsize - 1))
             return np.where(bits & top, bits ^ top, ~bits).view(item)
-        wide = codes.astype(np.uint64) * np.uint64(self.scale)
+        wide = self.full(codes).astype(np.uint64) * np.uint64(self.scale)
         wide += np.uint64(self.offset % (1 << 64))
         return wide.astype(item)
 
+    def full(self, codes: NDArray[Any]) -> NDArray[Any]:
+        """Codes of colours as they would be if all bits had been stored."""
+        if not self.depth:
+            return codes
+        levels, top = np.uint32((1 << self.bits) - 1), np.uint32((1 << self.depth) - 1)
+        return ((codes.astype(np.uint32) * top + levels // np.uint32(2)) // levels).astype(
+            np.uint8 if self.depth <= 8 else np.uint16
+        )
+
     def to_json(self) -> dict[str, object]:
         """As it stands in the header."""
-        return {
+        entry: dict[str, object] = {
             "name": self.name,
             "kind": self.kind,
             "dtype": self.dtype,
@@ -123,6 +150,7 @@ class Attribute:
             "offset": self.offset,
             "scale": self.scale,
         }
+        return entry | ({"depth": self.depth} if self.depth else {})
 
     @classmethod
     def from_json(cls, entry: dict[str, Any]) -> Attribute:
@@ -141,6 +169,7 @@ class Attribute:
                 bits=int(entry["bits"]),
                 offset=int(entry["offset"]),
                 scale=int(entry["scale"]),
+                depth=int(entry.get("depth", 0)),
             )
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             if isinstance(error, Corrupt):

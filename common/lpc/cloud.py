@@ -20,7 +20,7 @@ class Cloud:
     Parameters
     ----------
     origin : ndarray, (3,) int64
-        Lattice coordinates of the cloud's smallest corner.
+        Lattice coordinates of the corner that positions count from; none is below it on any axis.
     position : ndarray, (k, 3) uint16
         Lattice coordinates relative to `origin`, without their `shift` low bits.
     shift : int

@@ -30,6 +30,7 @@ MAJOR, MINOR = 1, 0
 HEADER_PROBE = 65536  # bytes of the first read: header, first page and first clouds
 MAX_TEXT = 49_152  # leaves a quarter of the probe to the first page and clouds
 
+_OBJECTS = ("left_out", "rejected", "bits_per_sample", "attribute_bits")
 _FIXED = struct.Struct("<8sHHIII")
 _Bytes = bytes  # the field `bytes` of Header hides the builtin inside the class
 
@@ -70,6 +71,7 @@ class Header:
     left_out: Mapping[str, str] = field(default_factory=dict)
     rejected: Mapping[str, int] = field(default_factory=dict)
     bits_per_sample: Mapping[str, float] = field(default_factory=dict)
+    attribute_bits: Mapping[str, float] = field(default_factory=dict)
     spacing_ratio: tuple[float, float, float] = (1.0, 1.0, 1.0)
     seed: int = 0
     generator: str = ""
@@ -104,7 +106,7 @@ class Header:
                 entry[item.name] = getattr(self, item.name)
         entry["attributes"] = [attribute.to_json() for attribute in self.attributes]
         entry["constants"] = {name: constant.to_json() for name, constant in self.constants.items()}
-        for name in ("left_out", "rejected", "bits_per_sample"):
+        for name in _OBJECTS:
             entry[name] = dict(entry[name])
         return entry
 
@@ -235,6 +237,7 @@ def _load(text: _Bytes) -> dict[str, Any]:
 
 def _from_json(entry: dict[str, Any]) -> Header:
     known = {item.name for item in fields(Header) if item.init and item.name != "extra"}
+    entry = {"attribute_bits": {}, **entry}  # the first builders did not state it
     missing = sorted(known - entry.keys())
     if missing:
         raise Corrupt(f"header: {', '.join(missing)} missing")
@@ -243,7 +246,7 @@ def _from_json(entry: dict[str, Any]) -> Header:
         if not isinstance(values[name], list):
             raise Corrupt(f"header: {name} is not a list")
         values[name] = tuple(values[name])
-    for name in ("constants", "left_out", "rejected", "bits_per_sample"):
+    for name in ("constants", *_OBJECTS):
         if not isinstance(values[name], dict):
             raise Corrupt(f"header: {name} is not an object")
     listed = values["attributes"]

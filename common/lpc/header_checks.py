@@ -76,5 +76,6 @@ def check_attributes(header: Header) -> None:
         for key, value in getattr(header, name).items():
             if not isinstance(value, kind) or isinstance(value, bool):
                 raise Corrupt(f"header: {name} of {key[:40]} is not a {'text' if kind is str else 'count'}")
-    if not all(is_number(value) for value in header.bits_per_sample.values()):
-        raise Corrupt("header: bits_per_sample are not numbers")
+    for name in ("bits_per_sample", "attribute_bits"):
+        if not all(is_number(value) for value in getattr(header, name).values()):
+            raise Corrupt(f"header: {name} are not numbers")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .bounds import decode_centers, decode_cones
+from .density import Density
 from .errors import Corrupt, FormatError
 from .page import PAGE_HEADER, RECORD, SMALLEST_CLOUD, Page, child_counts, child_page_numbers, page_bytes, parse_page
 from .ranges import ByteRange
@@ -54,6 +55,8 @@ class IndexTree:
     page_offset : ndarray, (pages,) int64
         0 where it is not known yet.
     page_loaded : ndarray, (pages,) bool
+    density : Density
+        How even the scan is, of nodes that are known and linked.
     """
 
     def __init__(self, header: Header) -> None:
@@ -77,6 +80,7 @@ class IndexTree:
             self.level = np.zeros(nodes, np.uint8)
             self.page_offset = np.zeros(pages, np.int64)
             self.page_loaded = np.zeros(pages, bool)
+            self.density = Density(nodes)
             self._has_parent = np.zeros(nodes, bool)
             self._first_child = np.zeros(pages + 1, np.int64)
         except MemoryError as error:
@@ -135,6 +139,11 @@ class IndexTree:
         for nodes, level in levels:
             self.level[nodes] = level
             self.linked[nodes] = True
+        own = np.arange(first, stop)
+        fresh = np.unique(np.concatenate([own[self.linked[first:stop]], *(nodes for nodes, _ in levels)]))
+        fresh = fresh[self.known[fresh]]
+        depth = self.level[fresh]
+        self.density.add(self, [fresh[depth == level] for level in np.unique(depth)])
 
     def missing_pages(self, nodes: ArrayLike) -> NDArray[np.int64]:
         """Pages that hold some of these nodes, have not come, and whose offsets are known; each once, in order."""

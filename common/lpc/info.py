@@ -4,35 +4,40 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from .octahedral import max_error_degrees
+
 if TYPE_CHECKING:
+    from .attributes import Attribute
     from .header import Header
 
 FORMAT = "lpc 1"
 
 
-def info_dict(header: Header, *, length: int | None = None) -> dict[str, Any]:
-    """Describe a model in plain values, ready for JSON.
+def info_dict(header: Header) -> dict[str, Any]:
+    """Describe a whole model in plain values, ready for JSON.
 
     Parameters
     ----------
     header : Header
-    length : int, optional
-        Bytes of the file that are there; None: all of them.
 
     Returns
     -------
     dict
-        Lengths in model units; ``bounds`` is [min xyz, max xyz], ``attributes`` the names that `export` writes.
+        Lengths in model units; ``bounds`` is [min xyz, max xyz], ``attributes`` the names that `export` writes,
+        ``here`` what is there of a file that may be cut short.
     """
     return {
         "format": FORMAT,
-        "complete": length is None or length >= header.bytes,
+        "complete": True,
         "samples": header.samples,
         "clouds": header.nodes,
         "levels": header.levels,
         "cloud_size": header.cloud_size,
+        "here": {"samples": header.samples, "clouds": header.nodes},
         "bytes": header.bytes,
         "bits_per_sample": dict(header.bits_per_sample),
+        "attribute_bits": dict(header.attribute_bits),
+        "attribute_errors": {attribute.name: largest_error(attribute) for attribute in header.attributes},
         "spacing": header.spacing,
         "position_error": header.position_error,
         "bounds": [list(header.bounds[:3]), list(header.bounds[3:])],
@@ -46,3 +51,8 @@ def info_dict(header: Header, *, length: int | None = None) -> dict[str, Any]:
         "generator": header.generator,
         "digest": header.digest,
     }
+
+
+def largest_error(attribute: Attribute) -> float:
+    """How far a decoded value may be from what the scan said: normals in degrees, others in units of the value."""
+    return max_error_degrees(attribute.bits) if attribute.kind == "normal" else attribute.max_error

@@ -1,4 +1,4 @@
-"""The search of `octahedral.encode_normals` as a compiled kernel: the same arithmetic, sample by sample."""
+"""Both ways of `octahedral` as compiled kernels: the same arithmetic, sample by sample."""
 
 from __future__ import annotations
 
@@ -16,6 +16,28 @@ def nearest_codes(normals: NDArray[np.float64], bits: int) -> NDArray[np.uint16]
     codes = np.empty((len(normals), 2), np.uint16)
     _nearest_codes(normals, float((1 << (bits - 1)) - 1), codes)
     return codes
+
+
+def unit_vectors(codes: NDArray[Any], bits: int) -> NDArray[np.float32]:
+    """Give unit normals (n, 3) of (n, 2) codes; see `octahedral.decode_normals`."""
+    normals = np.empty((len(codes), 3), np.float32)
+    _unit_vectors(np.ascontiguousarray(codes, np.uint16), (1 << (bits - 1)) - 1, normals)
+    return normals
+
+
+@njit(cache=True, nogil=True)
+def _unit_vectors(codes: Any, centre: int, normals: Any) -> None:
+    for i in range(len(codes)):
+        u, v = np.int64(codes[i, 0]) - centre, np.int64(codes[i, 1]) - centre
+        if u == -centre and v == -centre:
+            normals[i, 0] = normals[i, 1] = normals[i, 2] = np.float32(0)
+            continue
+        w = centre - abs(u) - abs(v)
+        if w < 0:
+            u, v = (centre - abs(v)) * (1 if u >= 0 else -1), (centre - abs(u)) * (1 if v >= 0 else -1)
+        x, y, z = np.float32(u), np.float32(v), np.float32(w)
+        length = np.sqrt(x * x + y * y + z * z)
+        normals[i, 0], normals[i, 1], normals[i, 2] = x / length, y / length, z / length
 
 
 @njit(cache=True, nogil=True)

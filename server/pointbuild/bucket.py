@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba import njit
 
-from lpc.octahedral import decode_normals
+from lpc.octahedral_compiled import unit_vectors
 
 from .areas import Probing, measure
 from .rows import as_words, positions
@@ -106,13 +106,6 @@ class BucketTree:
         return cls(Tree(*table), Clouds(*rest[:5]), upper, Clouds(*rest[5:10]), area, float(cell), spacing, weight)
 
 
-def normal_table(bits: int) -> NDArray[np.int32]:
-    """Decode all codes, ``table[u << bits | v]`` in multiples of 1 / `NORMAL_UNIT`."""
-    codes = np.arange(1 << (2 * bits))
-    pairs = np.stack([codes >> bits, codes & ((1 << bits) - 1)], axis=1).astype(np.uint8)
-    return np.rint(decode_normals(pairs, bits).astype(np.float64) * NORMAL_UNIT).astype(np.int32)
-
-
 def partition(
     first_row: int,
     bucket: Bucket,
@@ -123,7 +116,7 @@ def partition(
     probing: Probing,
     cloud_size: int,
     regions: Rows,
-    normals: NDArray[np.int32] | None,
+    normal_bits: int,
 ) -> BucketTree:
     """Sort a bucket's rows by node, in place on disk; `Rows.settle` may be called once the result is safe.
 
@@ -137,8 +130,8 @@ def partition(
         How to divide and measure.
     regions : Rows
         Where they are.
-    normals : ndarray or None
-        `normal_table`, if rows have normals.
+    normal_bits : int
+        Of their normals; 0: they have none.
     """
     rows = np.empty(bucket.count, regions.dtype)
     regions.read(first_row, rows)
@@ -161,7 +154,7 @@ def partition(
     del owner, group, priority
     out = np.empty_like(rows)
     np.take(as_words(rows), order, axis=0, out=as_words(out), mode="clip")  # "raise" would copy once more
-    clouds = summarise(out, ends - counts, counts, normals)
+    clouds = summarise(out, ends - counts, counts, normal_bits)
     with regions.rewriting(first_row) as file:
         write_all(file, out, 0)
     clouds.first[:] += first_row
@@ -266,16 +259,13 @@ def _order(group: Any, place: Any, order: Any) -> None:
         place[group[i]] += 1
 
 
-def summarise(
-    rows: NDArray[Any], first: NDArray[np.int64], samples: NDArray[np.int64], normals: NDArray[np.int32] | None
-) -> Clouds:
+def summarise(rows: NDArray[Any], first: NDArray[np.int64], samples: NDArray[np.int64], normal_bits: int) -> Clouds:
     """Box and sum the normals of runs of rows."""
     box = np.empty((len(first), 6))
     sums, bare = np.zeros((len(first), 3), np.int64), np.zeros(len(first), np.int64)
     _boxes(positions(rows), first, samples, box)
-    if normals is not None:
-        bits = (len(normals).bit_length() - 1) // 2
-        _sum_normals(rows["normal"], normals, bits, first, samples, sums, bare)
+    if normal_bits:
+        _sum_normals(unit_vectors(rows["normal"], normal_bits), first, samples, sums, bare)
     return Clouds(first.copy(), samples, box, sums, bare)
 
 
@@ -290,13 +280,13 @@ def _boxes(xyz: Any, first: Any, samples: Any, box: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _sum_normals(codes: Any, normals: Any, bits: Any, first: Any, samples: Any, sums: Any, bare: Any) -> None:
+def _sum_normals(normals: Any, first: Any, samples: Any, sums: Any, bare: Any) -> None:
     for cloud in range(len(first)):
-        x, y, z = 0, 0, 0
+        x, y, z = np.int64(0), np.int64(0), np.int64(0)
         for i in range(first[cloud], first[cloud] + samples[cloud]):
-            code = (np.int64(codes[i, 0]) << bits) | np.int64(codes[i, 1])
-            x += normals[code, 0]
-            y += normals[code, 1]
-            z += normals[code, 2]
-            bare[cloud] += code == 0
+            a, b, c = np.float64(normals[i, 0]), np.float64(normals[i, 1]), np.float64(normals[i, 2])
+            x += np.int64(np.rint(a * NORMAL_UNIT))
+            y += np.int64(np.rint(b * NORMAL_UNIT))
+            z += np.int64(np.rint(c * NORMAL_UNIT))
+            bare[cloud] += a == 0.0 and b == 0.0 and c == 0.0
         sums[cloud, 0], sums[cloud, 1], sums[cloud, 2] = x, y, z

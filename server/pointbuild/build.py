@@ -159,13 +159,13 @@ def _build(
         blocks = [Block(*block) for block in recalled[1].tolist()]
     # The crew comes last and goes first: no thread may hold a file that is closed.
     with (
-        closing(Spool(folder.path / "spool", columns_of(inputs.attributes), blocks)) as spool,
+        closing(Spool(folder.path / "spool", columns_of(inputs.attributes, options.precision), blocks)) as spool,
         closing(Regions(folder.path / "rows")) as regions,
         cluster.crew(sizes.threads, folder) if cluster else Crew(sizes.threads) as crew,
     ):
         progress.stage("read", spool.samples or inputs.samples_hint)
         if recalled is None:
-            found = survey(inputs.batches(sizes.block), spool, crew, progress)
+            found = survey(inputs.batches(sizes.block), spool, crew, progress, options.precision)
             told = {"inputs": inputs.to_json(), "sizes": asdict(sizes), "found": found.to_json()}
             journal.add(as_array(told), np.array([astuple(block) for block in spool.blocks], np.int64))
             folder.remove("normals-*")
@@ -196,7 +196,7 @@ def _estimate(scan: Scan, *, scratch: Path, options: BuildOptions) -> Scan:
 
 def _sizes(inputs: Inputs, out: Path, folder: Folder, options: BuildOptions) -> memory.Sizes:
     """Check the disk, and share out the memory."""
-    spool_bytes = sum(column.itemsize for column in columns_of(inputs.attributes))
+    spool_bytes = sum(column.itemsize for column in columns_of(inputs.attributes, options.precision))
     attribute_bytes = spool_bytes - 24  # codes are never wider than values
     samples = inputs.samples_at_most
     row_bytes = whole_words(row_start(single=False) + attribute_bytes)

@@ -45,6 +45,10 @@ if TYPE_CHECKING:
               help="Of the hash that picks each cloud's samples.")  # fmt: skip
 @click.option("--normals", default="auto", show_default=True, type=click.Choice(["auto", "keep", "estimate", "drop"]),
               help="auto: those of the scan, or of a mesh's faces.")  # fmt: skip
+@click.option("--normal-bits", default=8, show_default=True, type=click.IntRange(2, 16),
+              help="Of each of a normal's two numbers.")  # fmt: skip
+@click.option("--colour-bits", "--color-bits", "color_bits", default=None, type=click.IntRange(1, 16),
+              help="Of each of a colour's three; default: all that it has.")  # fmt: skip
 @click.option("--attributes", default=None, metavar="LIST|all",
               help="Names with commas between; default: normal,color,intensity,classification.")  # fmt: skip
 @click.option("--effort", default="default", show_default=True, type=click.Choice(["fast", "default", "best"]),

@@ -1,4 +1,4 @@
-"""What each kind of number costs in a model: the header's `bits_per_sample`."""
+"""What each number of a sample costs in a model: the header's `bits_per_sample` and `attribute_bits`."""
 
 from __future__ import annotations
 
@@ -13,17 +13,15 @@ from lpc.header import seal
 from lpc.payload import parse_layout
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from numpy.typing import NDArray
 
     from lpc.attributes import Schema
     from lpc.header import Header
 
-KINDS = ("position", "normal", "color", "other")
-
 DIGITS = (4, 5, 6, 7, 8, 9, 10, 3, 2)
 """Decimals of the parts, in the order in which they are tried."""
+EXACT = 9
+"""Decimals of what is stated to the end."""
 ROUNDS = 8
 """In which a length settles, or never."""
 
@@ -31,8 +29,8 @@ _BLOCK_HEADER = 3
 _LARGEST_BLOCK = 1 << 17
 
 
-def cloud_costs(frame: bytes, samples: int, schema: Schema) -> dict[str, float]:
-    """Bytes of one cloud by `KINDS`; what no stream owns counts as position.
+def cloud_costs(frame: bytes, samples: int, schema: Schema) -> NDArray[np.float64]:
+    """Bytes of one cloud: of the positions, then of each attribute; what no stream owns counts as position.
 
     The codec ends a zstd block after all raw bits, after the tokens of positions and after those of each group of
     channels: sizes of blocks (RFC 8878, 3.1.1.2) say what tokens cost, and lengths of raw streams what raw bits do.
@@ -42,42 +40,48 @@ def cloud_costs(frame: bytes, samples: int, schema: Schema) -> dict[str, float]:
     raw = np.diff(np.append(layout.starts, layout.tokens)).astype(float)
     pieces = [layout.tokens, samples, *(samples * (stop - first) for first, stop in channels.groups)]
     stored = _stored(frame, pieces)
-    owners = [
-        attribute.kind if attribute.kind in KINDS else "other"
-        for attribute in schema
-        for _ in range(len(channels_of((attribute,))))
-    ]
-    costs = dict.fromkeys(KINDS, 0.0)
+    owners = np.repeat(np.arange(len(schema)), [len(channels_of((attribute,))) for attribute in schema])
+    costs = np.zeros(1 + len(schema))
     for owner, size in zip(owners, raw[2:], strict=True):
-        costs[owner] += size * stored[0] / pieces[0]
+        costs[1 + owner] += size * stored[0] / pieces[0]
     for (first, _), size in zip(channels.groups, stored[2:], strict=True):
-        costs[owners[first]] += size
-    costs["position"] = len(frame) - sum(costs.values())
+        costs[1 + owners[first]] += size
+    costs[0] = len(frame) - costs.sum()
     return costs
 
 
-def bits_per_sample(
-    parts: Mapping[str, float], cloud_bytes: int, file_bytes: int, samples: int, *, digits: int = DIGITS[0]
-) -> dict[str, float]:
-    """Scale the costs of some clouds to the whole file; what is no cloud is ``index``: the pages and the header.
+def bits_of(
+    header: Header, parts: NDArray[np.float64], cloud_bytes: int, *, digits: int = DIGITS[0]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Scale the costs of some clouds to the whole file: bits a sample by kind, and by attribute.
+
+    What is no cloud is ``index``: the pages and the header. Positions take what the rounding of the others leaves, so
+    that the parts add up to the total.
 
     Parameters
     ----------
-    parts : mapping
+    header : Header
+    parts : ndarray
         Summed `cloud_costs` of some clouds.
-    cloud_bytes, file_bytes : int
-        Of all clouds and of the file.
-    samples : int
+    cloud_bytes : int
+        Of all clouds.
     digits : int
-        Decimals of the parts; the total has all.
+        Decimals of the parts; position and total have more.
     """
-    scale = 8 * cloud_bytes / samples / sum(parts.values())
-    bits = {name: float(parts[name]) * scale for name in KINDS}
-    bits["index"] = 8 * (file_bytes - cloud_bytes) / samples
-    return {name: round(value, digits) for name, value in bits.items()} | {"total": 8 * file_bytes / samples}
+    scale = 8 * cloud_bytes / header.samples / float(parts.sum())
+    costs = zip(header.attributes, parts[1:].tolist(), strict=True)
+    attributes = {attribute.name: round(part * scale, digits) for attribute, part in costs}
+    index = round(8 * (header.bytes - cloud_bytes) / header.samples, digits)
+    kinds = dict.fromkeys(("position", "normal", "color", "other"), 0.0)
+    for attribute in header.attributes:
+        kind = "other" if attribute.kind == "scalar" else attribute.kind
+        kinds[kind] = round(kinds[kind] + attributes[attribute.name], digits)
+    total = 8 * header.bytes / header.samples
+    kinds["position"] = round(total - index - sum(kinds.values()), EXACT)
+    return kinds | {"index": index, "total": total}, attributes
 
 
-def seal_with_costs(header: Header, records: NDArray[Any], parts: Mapping[str, float], cloud_bytes: int) -> Header:
+def seal_with_costs(header: Header, records: NDArray[Any], parts: NDArray[np.float64], cloud_bytes: int) -> Header:
     """Seal a header that states what its own file costs a sample, itself included.
 
     Digits of the numbers lengthen the header, which changes the numbers. Where no length states itself, some more
@@ -86,10 +90,10 @@ def seal_with_costs(header: Header, records: NDArray[Any], parts: Mapping[str, f
     for digits in DIGITS:
         sealed = seal(header, records)
         for _ in range(ROUNDS):
-            bits = bits_per_sample(parts, cloud_bytes, sealed.bytes, header.samples, digits=digits)
+            bits, attributes = bits_of(sealed, parts, cloud_bytes, digits=digits)
             if bits == sealed.bits_per_sample:
                 return sealed
-            sealed = seal(replace(header, bits_per_sample=bits), records)
+            sealed = seal(replace(header, bits_per_sample=bits, attribute_bits=attributes), records)
     return sealed
 
 

@@ -10,16 +10,17 @@ import numpy as np
 
 from .areas import Probing
 from .assemble import Nodes, assemble
-from .bucket import BucketTree, normal_table, partition
+from .bucket import BucketTree, partition
 from .pile import check_piles, partition_pile
 from .plan import Plan, make_plan
 from .rows import row_dtype
 from .scatter import Candidates, Regions, Scattered, gather, scatter
 from .spacing import model_spacing
-from .survey import NORMAL_BITS
 from .upper import Upper, candidate_limits, thresholds
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
     from numpy.typing import NDArray
 
     from lpc.attributes import Schema
@@ -93,10 +94,15 @@ def divide(
     regions.restore()
     limits = candidate_limits(plan, cloud_size, slack)
     candidates = _scatter(spool, cells, plan, limits, seed, schema, regions, folder, crew, progress)
+    gathered = folder.journal("gather")
+    known = iter(gathered)
     while (upper := thresholds(plan, candidates, limits, cloud_size)) is None:
         slack *= 4
         limits = candidate_limits(plan, cloud_size, slack)
-        candidates = gather(regions, limits, GATHERED)
+        recalled = next(known, None)
+        candidates = gather(regions, limits, GATHERED) if recalled is None else Candidates(*recalled)
+        if recalled is None:
+            gathered.add(candidates.priority, candidates.bucket)
     rows = crew.share(regions, folder)
     trees = _partition(plan, upper, cells, probing, most, cloud_size, schema, rows, folder, crew, progress)
     spacing = model_spacing(
@@ -133,6 +139,14 @@ def _scatter(
     def one(block: Block) -> Scattered:
         return scatter(block, spool, cells, plan, limits, seed, schema, regions.dtype)
 
+    def placed(blocks: Iterable[Block]) -> Iterator[tuple[Block, Scattered, NDArray[np.int64]]]:
+        for block, part in crew.map(one, blocks):
+            yield block, part, regions.reserve(part.counts)
+
+    def write(entry: tuple[Block, Scattered, NDArray[np.int64]]) -> None:
+        _, part, places = entry
+        regions.place(part.rows, part.counts, places)
+
     journal = folder.journal("scatter")
     waiting = spool.blocks[::-1]  # from the end of the spool, which makes room for the rows
     found = []
@@ -140,8 +154,7 @@ def _scatter(
         regions.skip(counts)
         found.append(Candidates(priority, bucket))
         progress.advance(waiting.pop(0).samples)
-    for block, part in crew.map(one, waiting):
-        regions.append(part.rows, part.counts)
+    for (block, part, _), _ in crew.map(write, placed(waiting)):
         found.append(part.candidates)
         journal.add(part.counts, part.candidates.priority, part.candidates.bucket)
         spool.cut(block)
@@ -165,9 +178,6 @@ def _partition(
     progress: Progress,
 ) -> list[BucketTree]:
     progress.stage("partition", int(rows.first[-1]))
-    has_normals = any(attribute.name == "normal" for attribute in schema)
-    table = normal_table(NORMAL_BITS) if has_normals else None
-
     one = partial(
         _partition_bucket,
         plan=plan,
@@ -177,7 +187,7 @@ def _partition(
         probing=probing,
         cloud_size=cloud_size,
         regions=rows,
-        normals=table,
+        normal_bits=next((attribute.bits for attribute in schema if attribute.kind == "normal"), 0),
     )
     journal = folder.journal("partition")
     trees: list[BucketTree] = []

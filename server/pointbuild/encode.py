@@ -16,8 +16,10 @@ from numba import njit
 
 from lpc.bounds import decode_centers, quantise_cones, quantise_spheres
 from lpc.codec import Effort, encode_clouds
+from lpc.context import ANCESTORS
 from lpc.lattice import quantise
 from lpc.octahedral import decode_normals, encode_normals
+from lpc.octahedral_compiled import unit_vectors
 from lpc.page import RECORD
 
 from .rows import positions
@@ -90,37 +92,44 @@ def encode_run(
     regions: Rows,
     schema: Schema,
     effort: Effort,
-    table: NDArray[np.float32] | None,
 ) -> Run:
-    """Encode nodes `first` to `stop - 1`.
-
-    `table` are the decoded normals of all codes where the schema has normals (`normal_vectors`).
-    """
-    counts = nodes.samples[first:stop]
-    bounds = np.concatenate([[0], np.cumsum(counts)])
+    """Encode nodes `first` to `stop - 1`."""
+    family = _family(first, stop, nodes.parent)
+    before = len(family) - (stop - first)
+    bounds = np.concatenate([[0], np.cumsum(nodes.samples[family])])
     rows = np.empty(bounds[-1], regions.dtype)
     at = 0
-    for run in range(nodes.run_start[first], nodes.run_start[stop]):
-        count = int(nodes.run_count[run])
-        regions.read(int(nodes.run_first[run]), rows[at : at + count])
-        at += count
+    for node in family.tolist():
+        for run in range(nodes.run_start[node], nodes.run_start[node + 1]):
+            count = int(nodes.run_count[run])
+            regions.read(int(nodes.run_first[run]), rows[at : at + count])
+            at += count
     lattice = quantise(positions(rows), geometry.origin, geometry.step)
     codes = {attribute.name: rows[attribute.name] for attribute in schema}
-    frames = encode_clouds(lattice, codes, bounds, schema, effort=effort)
+    place = np.searchsorted(family, nodes.parent[family])
+    parent = np.where(family[place] == nodes.parent[family], place, -1)
+    frames = encode_clouds(lattice, codes, bounds, schema, parent=parent, first=before, effort=effort)
+    own = int(bounds[before])
+    lattice, rows, bounds = lattice[own:], rows[own:], bounds[before:] - own
     shape = (stop - first, int(nodes.depth[first:stop].max()) + 1)
     reach, spread = np.zeros(shape), np.zeros(shape)
     _reach(lattice, bounds, first, nodes.parent, nodes.depth, geometry.origin, geometry.step, geometry.center, reach)
-    if table is not None:
-        bits = (len(table).bit_length() - 1) // 2
-        _spread(rows["normal"], table, bits, bounds, first, nodes.parent, nodes.depth, geometry.axis, spread)
+    for attribute in schema:
+        if attribute.kind == "normal":
+            normals = unit_vectors(rows[attribute.name], attribute.bits)
+            _spread(normals, bounds, first, nodes.parent, nodes.depth, geometry.axis, spread)
     sizes = np.array([len(frame) for frame in frames], np.uint32)
     return Run(first, frames, sizes, np.array([zlib.crc32(frame) for frame in frames], np.uint32), reach, spread)
 
 
-def normal_vectors(bits: int) -> NDArray[np.float32]:
-    """Decode all codes: ``table[u << bits | v]``."""
-    codes = np.arange(1 << (2 * bits))
-    return decode_normals(np.stack([codes >> bits, codes & ((1 << bits) - 1)], axis=1).astype(np.uint8), bits)
+def _family(first: int, stop: int, parent: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Nodes `first` to `stop - 1`, after those that are context of theirs."""
+    above = line = np.arange(first, stop)
+    for _ in range(ANCESTORS):
+        line = np.unique(parent[line])
+        line = line[line >= 0]
+        above = np.union1d(above, line)
+    return above
 
 
 def kernels_are_loaded() -> bool:
@@ -188,15 +197,12 @@ def _reach(
 
 
 @njit(cache=True, nogil=True, fastmath={"nnan", "nsz"})
-def _spread(
-    codes: Any, table: Any, bits: int, bounds: Any, first: int, parent: Any, depth: Any, axis: Any, out: Any
-) -> None:
+def _spread(normals: Any, bounds: Any, first: int, parent: Any, depth: Any, axis: Any, out: Any) -> None:
     for cloud in range(len(bounds) - 1):
         begin, end = bounds[cloud], bounds[cloud + 1]
         x, y, z = np.empty(end - begin), np.empty(end - begin), np.empty(end - begin)
         for i in range(end - begin):
-            code = (np.int64(codes[begin + i, 0]) << bits) | np.int64(codes[begin + i, 1])
-            x[i], y[i], z[i] = table[code, 0], table[code, 1], table[code, 2]
+            x[i], y[i], z[i] = normals[begin + i, 0], normals[begin + i, 1], normals[begin + i, 2]
         node = first + cloud
         while node >= 0:
             px, py, pz = float(axis[node, 0]), float(axis[node, 1]), float(axis[node, 2])

@@ -22,7 +22,9 @@ NODE_BYTES = 400  # a node's arrays, and their copies while the trees are joined
 READ_BYTES = 320  # a sample in a reader's batch, decoded and as it was stored, and on its way to a row
 ATTRIBUTE_BYTES = 5  # times its attributes
 BEST_BLOCK = 1 << 18
-BEST_BUCKET = 1 << 20  # larger buckets cost no less (studied), and keep threads from sharing the work evenly
+BEST_BUCKET = 1 << 19  # larger ones cost a fifth more, and keep threads from sharing the work evenly
+MANY_BUCKETS = 1 << 10  # of more samples buckets grow, for what the nodes above them hold in memory
+MOST_BUCKET = 1 << 20
 LEAST_BLOCK = 1 << 13
 
 
@@ -62,7 +64,8 @@ def choose_sizes(options: BuildOptions, samples: int, row_bytes: int, resident: 
         threads -= 1
     block = min(room // ((threads + 2) * read), BEST_BLOCK)
     fair = max(samples // (4 * (threads + 2)), least_bucket)  # buckets that move are on disk twice: a quarter in all
-    bucket = min(room // (threads * per_sample), BEST_BUCKET, fair)
+    best = min(max(samples // MANY_BUCKETS, BEST_BUCKET), MOST_BUCKET)
+    bucket = min(room // (threads * per_sample), best, fair)
     if block < LEAST_BLOCK or bucket < least_bucket:
         need = held + least_bucket * per_sample + 3 * LEAST_BLOCK * read
         raise BuildError(

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Literal
 
 from lpc.errors import BuildError
 
+from .survey import Precision
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -34,6 +36,10 @@ class BuildOptions:
         them to the neighbours; ``drop``: none.
     attributes : tuple of str, or None *
         Names to keep; ``("all",)`` for everything; None: normal, color, intensity and classification.
+    normal_bits : int *
+        Bits of an octahedral axis, 2 to 16.
+    color_bits : int or None *
+        Bits of a colour channel at most, 1 to 16; None: as many as it takes to keep all values.
     effort : {"default", "best", "fast"} *
         What the codec spends on size.
     page_nodes : int *
@@ -55,6 +61,8 @@ class BuildOptions:
     seed: int = 0
     normals: Literal["auto", "keep", "estimate", "drop"] = "auto"
     attributes: tuple[str, ...] | None = None
+    normal_bits: int = 8
+    color_bits: int | None = None
     effort: Effort = "default"
     page_nodes: int = 128
     memory_bytes: int = 2 << 30
@@ -71,10 +79,19 @@ class BuildOptions:
             raise BuildError(f"a position error of {error} is not a length above 0")
         if not -(2**63) <= self.seed < 2**64:
             raise BuildError(f"the seed {self.seed} has more than 64 bits")
+        if not 2 <= self.normal_bits <= 16:
+            raise BuildError(f"normals of {self.normal_bits} bits an axis are not possible: choose 2 to 16")
+        if self.color_bits is not None and not 1 <= self.color_bits <= 16:
+            raise BuildError(f"colours of {self.color_bits} bits a channel are not possible: choose 1 to 16")
         if not 1 <= self.page_nodes <= 4096:
             raise BuildError(f"{self.page_nodes} records a page are not possible: choose 1 to 4096")
         if min(self.threads, self.block_samples, self.bucket_samples) < 0 or self.memory_bytes <= 0:
             raise BuildError("memory, threads and sizes must not be negative")
+
+    @property
+    def precision(self) -> Precision:
+        """How exactly attributes are kept."""
+        return Precision(normal_bits=self.normal_bits, color_bits=self.color_bits)
 
     @property
     def workers(self) -> int:

@@ -53,7 +53,7 @@ def partition_pile(
     probing: Probing,
     cloud_size: int,
     regions: Rows,
-    normals: NDArray[np.int32] | None,
+    normal_bits: int,
 ) -> BucketTree:
     """Sort a pile's rows by node, on disk.
 
@@ -61,7 +61,7 @@ def partition_pile(
     ----------
     most : int
         Rows to hold in memory.
-    first_row, bucket, above, thresholds, cells, probing, cloud_size, regions, normals
+    first_row, bucket, above, thresholds, cells, probing, cloud_size, regions, normal_bits
         As for `bucket.partition`.
 
     Raises
@@ -70,6 +70,7 @@ def partition_pile(
         If more samples coincide than a chain of nodes can hold.
     """
     taken = _sort_by_priority(first_row, bucket.count, thresholds, most, regions)
+    ordered = regions.replaced()
     left = bucket.count - int(taken.sum())
     first = cells.fixed(positions(next(regions.chunks(first_row, 1, 1))))
     tree = _chain(bucket, left, cloud_size, cells, first[0])
@@ -77,15 +78,15 @@ def partition_pile(
     clouds, at = [], first_row
     for count in counts.tolist():
         rows = np.empty(count, regions.dtype)
-        regions.read(at, rows)
-        part = summarise(rows, np.zeros(1, np.int64), np.array([count]), normals)
+        ordered.read(at, rows)
+        part = summarise(rows, np.zeros(1, np.int64), np.array([count]), normal_bits)
         part.first[:] += at
         clouds.append(part.arrays())
         at += count
     whole = Clouds(*(np.concatenate(parts) for parts in zip(*clouds, strict=True)))
     used = np.flatnonzero(taken)
     (face,) = cells.faces(first, np.array([bucket.depth]))
-    asked = next(regions.chunks(first_row, min(bucket.count, probing.region), probing.region))
+    asked = next(ordered.chunks(first_row, min(bucket.count, probing.region), probing.region))
     priority = np.ascontiguousarray(asked["priority"])
     spacing = pile_spacing(positions(asked), priority, face, probing, bucket.count)
     measured = [spacing] if spacing > 0 else []

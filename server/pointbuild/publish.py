@@ -12,10 +12,9 @@ from lpc.errors import BuildError
 from lpc.header import Header
 from lpc.lattice import EPSILON, SLACK, position_error_bound, position_step
 
-from .costs import KINDS, cloud_costs, seal_with_costs
-from .encode import Geometry, Records, Run, encode_run, normal_vectors
+from .costs import cloud_costs, seal_with_costs
+from .encode import Geometry, Records, Run, encode_run
 from .spacing import node_spacings
-from .survey import NORMAL_BITS, Survey
 from .write import write_model
 
 if TYPE_CHECKING:
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from lpc.attributes import Schema
     from lpc.codec import Effort
 
     from .assemble import Nodes
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from .options import BuildOptions
     from .progress import Progress
     from .rows import Rows
+    from .survey import Survey
     from .work import Crew
 
 GENERATOR = "pointstream 0.1"
@@ -148,16 +149,15 @@ def _encode(
     effort: Effort,
     crew: Crew,
     progress: Progress,
-) -> dict[str, float]:
-    """Write all clouds in order and fill the records; what the kinds of numbers cost in some of the clouds."""
+) -> NDArray[np.float64]:
+    """Write all clouds in order and fill the records; what positions and attributes cost in some of them."""
     nodes, geometry = records.nodes, records.geometry
-    has_normals = any(attribute.kind == "normal" for attribute in found.schema)
-    table = normal_vectors(NORMAL_BITS) if has_normals else None
+    costed = np.unique(np.linspace(0, len(nodes) - 1, COSTED_CLOUDS).astype(int))
+    schema = found.schema
     one = partial(
-        _encode_run, nodes=nodes, geometry=geometry, regions=regions, schema=found.schema, effort=effort, table=table
+        _encode_run, costed=costed, nodes=nodes, geometry=geometry, regions=regions, schema=schema, effort=effort
     )
-    costs = np.zeros(len(KINDS))
-    costed = set(np.linspace(0, len(nodes) - 1, COSTED_CLOUDS).astype(int).tolist())
+    costs = np.zeros(1 + len(found.schema))
     waiting = runs(nodes, RUN_SAMPLES)
     for sizes, checks, reach, spread, part in journal:
         first, stop = waiting.pop(0)
@@ -166,22 +166,26 @@ def _encode(
         clouds.seek(int(sizes.sum(dtype=np.int64)), os.SEEK_CUR)
         progress.advance(int(nodes.samples[first:stop].sum()))
     clouds.truncate()
-    for (first, stop), run in crew.spread(one, waiting):
+    for (first, stop), (run, part) in crew.spread(one, waiting):
         clouds.writelines(run.frames)
         clouds.flush()
         records.add(run)
-        part = np.zeros(len(KINDS))
-        for node in sorted(costed.intersection(range(first, stop))):
-            found_costs = cloud_costs(run.frames[node - first], int(nodes.samples[node]), found.schema)
-            part += [found_costs[kind] for kind in KINDS]
         costs += part
         journal.add(run.sizes, run.checks, run.reach, run.spread, part)
         progress.advance(int(nodes.samples[first:stop].sum()))
-    return dict(zip(KINDS, costs.tolist(), strict=True))
+    return costs
 
 
-def _encode_run(run: tuple[int, int], **shared: Any) -> Run:
-    return encode_run(*run, **shared)
+def _encode_run(
+    run: tuple[int, int], *, costed: NDArray[np.int64], nodes: Nodes, schema: Schema, **shared: Any
+) -> tuple[Run, NDArray[np.float64]]:
+    """Encode a run of nodes; and the `cloud_costs` of those of its clouds that are `costed`."""
+    first, stop = run
+    encoded = encode_run(first, stop, nodes=nodes, schema=schema, **shared)
+    costs = np.zeros(1 + len(schema))
+    for node in costed[(costed >= first) & (costed < stop)].tolist():
+        costs += cloud_costs(encoded.frames[node - first], int(nodes.samples[node]), schema)
+    return encoded, costs
 
 
 def runs(nodes: Nodes, samples: int) -> list[tuple[int, int]]:

@@ -1,7 +1,8 @@
 """Pass 2: every sample to its bucket's region of one file, and the first candidates for the upper tree.
 
-Threads sort blocks by bucket, one thread writes them in turn: so the place of a block's rows is known from the
-counts of those before it, and a build that was killed can go on with the next. Nothing else depends on that place.
+Threads sort blocks by bucket and write them. Places are given out in the order of the blocks, so that of a block's rows
+is known from the counts of those before it, and a build that was killed can go on with the next. Nothing else depends
+on that place.
 """
 
 from __future__ import annotations
@@ -76,14 +77,18 @@ class Regions:
         """Pass over rows that were appended before."""
         self._filled += counts
 
-    def append(self, sorted_rows: NDArray[Any], counts: NDArray[np.int64]) -> None:
-        """Add rows that are sorted by bucket, `counts` of each; one thread only."""
-        at = self.first[:-1] + self._filled
-        self._filled += counts
+    def reserve(self, counts: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Give the number of the next free row of each bucket, of which `counts` are taken."""
+        places = self.first[:-1] + self._filled
+        self.skip(counts)
+        return places
+
+    def place(self, sorted_rows: NDArray[Any], counts: NDArray[np.int64], places: NDArray[np.int64]) -> None:
+        """Write rows that are sorted by bucket, `counts` of each, where `reserve` said."""
         begin = 0
         for bucket in np.flatnonzero(counts):
             end = begin + int(counts[bucket])
-            self.write(int(at[bucket]), sorted_rows[begin:end])
+            self.write(int(places[bucket]), sorted_rows[begin:end])
             begin = end
 
     def write(self, row: int, rows: NDArray[Any]) -> None:

@@ -66,18 +66,22 @@ class Spool:
         fresh = 0 if blocks else os.O_TRUNC
         self._file = os.open(path, os.O_RDWR | os.O_CREAT | fresh | os.O_CLOEXEC, 0o600)
 
-    def append(self, values: Mapping[str, NDArray[Any]]) -> None:
-        """Add a block of samples."""
-        count = len(values["xyz"])
-        if not count:
-            return
-        block = Block(self.samples, count, self._length)
+    def reserve(self, samples: int) -> Block:
+        """Make room for a block after all others."""
+        block = Block(self.samples, samples, self._length)
+        self._length += sum(column.itemsize for column in self.columns) * samples
+        if samples:
+            self.blocks.append(block)
+        self.samples += samples
+        return block
+
+    def write(self, block: Block, values: Mapping[str, NDArray[Any]]) -> None:
+        """Write the samples of a block; any thread may."""
+        offset = block.offset
         for column in self.columns:
             data = np.ascontiguousarray(values[column.name], dtype=column.dtype)
-            write_all(self._file, data, self._length)
-            self._length += data.nbytes
-        self.blocks.append(block)
-        self.samples += count
+            write_all(self._file, data, offset)
+            offset += data.nbytes
 
     def read(self, block: Block, names: tuple[str, ...] | None = None) -> dict[str, NDArray[Any]]:
         """Columns of a block by name; all of them if no names are given."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,10 +19,10 @@ from lpc.errors import ScanError
 from lpc.octahedral import encode_normals
 
 from .readers import finite
-from .spool import Column, Spool
+from .spool import Block, Column, Spool
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator
 
     from numpy.typing import NDArray
 
@@ -30,7 +31,21 @@ if TYPE_CHECKING:
     from .progress import Progress
     from .work import Crew
 
-NORMAL_BITS = 8
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Precision:
+    """How exactly attributes are kept; scalars always are as they came.
+
+    Parameters
+    ----------
+    normal_bits : int
+        Of an octahedral axis.
+    color_bits : int or None
+        Of a colour channel at most; None: as many as it takes to keep all values.
+    """
+
+    normal_bits: int = 8
+    color_bits: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,18 +102,19 @@ class Survey:
         )
 
 
-def columns_of(attributes: dict[str, np.dtype[Any]]) -> tuple[Column, ...]:
+def columns_of(attributes: dict[str, np.dtype[Any]], precision: Precision) -> tuple[Column, ...]:
     """Columns of the spool: positions as they came, normals as codes, everything else as it came."""
     columns = [Column("xyz", np.dtype("<f8"), 3)]
     for name, dtype in attributes.items():
         if name == "normal":
-            columns.append(Column(name, np.dtype(np.uint8), 2))
+            code = np.uint8 if precision.normal_bits <= 8 else np.uint16
+            columns.append(Column(name, np.dtype(code), 2))
         else:
             columns.append(Column(name, dtype.newbyteorder("<"), 3 if name == "color" else 1))
     return tuple(columns)
 
 
-def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Progress) -> Survey:
+def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Progress, precision: Precision) -> Survey:
     """Fill the spool.
 
     Parameters
@@ -110,6 +126,7 @@ def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Pr
     crew : Crew
         Prepares batches while the next one is read.
     progress : Progress
+    precision : Precision
 
     Raises
     ------
@@ -120,22 +137,28 @@ def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Pr
     single = True
     rejected: dict[str, int] = {}
     ranges = {column.name: _Range(column) for column in spool.columns[1:]}
-    for batch, (values, low, high, short, dropped) in crew.map(_prepare, batches):
-        for reason, count in dropped.items():
-            rejected[reason] = rejected.get(reason, 0) + count
-        single = single and short
-        np.minimum(box[0], low, out=box[0])
-        np.maximum(box[1], high, out=box[1])
-        for name, found in ranges.items():
-            found.add(values[name])
-        spool.append(values)
-        progress.advance(len(batch))
+    prepare = partial(_prepare, normal_bits=precision.normal_bits)
+
+    def looked_at() -> Iterator[tuple[Block, dict[str, NDArray[Any]], int]]:
+        nonlocal single
+        for batch, (values, low, high, short, dropped) in crew.map(prepare, batches):
+            for reason, count in dropped.items():
+                rejected[reason] = rejected.get(reason, 0) + count
+            single = single and short
+            np.minimum(box[0], low, out=box[0])
+            np.maximum(box[1], high, out=box[1])
+            for name, found in ranges.items():
+                found.add(values[name])
+            yield spool.reserve(len(values["xyz"])), values, len(batch)
+
+    for (_, _, count), _ in crew.map(lambda entry: spool.write(*entry[:2]), looked_at()):
+        progress.advance(count)
     if not spool.samples:
         why = f": all {sum(rejected.values()):,} records are not finite" if rejected else ""
         raise ScanError(f"the input holds no usable sample{why}")
     schema, constants, left_out = [], {}, {}
     for name, found in ranges.items():
-        verdict = found.verdict()
+        verdict = found.verdict(precision)
         if isinstance(verdict, Attribute):
             schema.append(verdict)
         elif isinstance(verdict, Constant):
@@ -145,7 +168,9 @@ def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Pr
     return Survey(box[0], box[1], tuple(schema), constants, left_out, {k: v for k, v in rejected.items() if v}, single)
 
 
-def _prepare(batch: PointBatch) -> tuple[dict[str, NDArray[Any]], NDArray[Any], NDArray[Any], bool, dict[str, int]]:
+def _prepare(
+    batch: PointBatch, normal_bits: int
+) -> tuple[dict[str, NDArray[Any]], NDArray[Any], NDArray[Any], bool, dict[str, int]]:
     """Give the samples of a batch as columns, their box, whether they are float32 numbers, and what was dropped."""
     dropped: dict[str, int] = {}
     box = np.empty((2, 3))
@@ -155,7 +180,7 @@ def _prepare(batch: PointBatch) -> tuple[dict[str, NDArray[Any]], NDArray[Any], 
         _, single = _box(batch.xyz, box)
     values: dict[str, NDArray[Any]] = {"xyz": batch.xyz}
     for name, column in batch.attributes.items():
-        values[name] = encode_normals(column, NORMAL_BITS) if name == "normal" else column
+        values[name] = encode_normals(column, normal_bits) if name == "normal" else column
     return values, box[0], box[1], single, dropped
 
 
@@ -213,11 +238,11 @@ class _Range:
                 self.divisor = math.gcd(self.divisor, int(np.gcd.reduce(apart)))
         self.low, self.high = min(self.low, low), max(self.high, high)
 
-    def verdict(self) -> Attribute | Constant | str:
+    def verdict(self, precision: Precision) -> Attribute | Constant | str:
         """How to store it, or its one value, or why not at all."""
         name, dtype = self.column.name, self.column.dtype.newbyteorder("<")
         if self.kind == "normal":
-            attribute = Attribute(name=name, kind="normal", dtype="<f4", bits=NORMAL_BITS)
+            attribute = Attribute(name=name, kind="normal", dtype="<f4", bits=precision.normal_bits)
             return "every normal is zero" if self.constant else attribute
         assert self.first is not None
         if self.constant and np.isfinite(self.first).all():
@@ -229,5 +254,7 @@ class _Range:
         if self.kind == "color":
             offset = 0
             scale = 1 if dtype.itemsize == 1 else 257 if self.repeated else 256 if self.shifted else 1
-        bits = max(((self.high - offset) // scale).bit_length(), 1)
-        return Attribute(name=name, kind=self.kind, dtype=dtype.str, bits=bits, offset=offset, scale=scale)
+        bits, depth = max(((self.high - offset) // scale).bit_length(), 1), 0
+        if self.kind == "color" and precision.color_bits is not None and precision.color_bits < bits:
+            bits, depth = precision.color_bits, bits
+        return Attribute(name=name, kind=self.kind, dtype=dtype.str, bits=bits, offset=offset, scale=scale, depth=depth)

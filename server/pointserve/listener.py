@@ -6,7 +6,7 @@ import asyncio
 import errno
 import socket
 import ssl
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any, cast
 
 from aiohttp import web
@@ -39,6 +39,8 @@ class Guests:
         self._total = total
         self._per_address = per_address
         self._seat = seat
+        self._here = 0
+        self._left = asyncio.Event()
 
     def enter(self, address: str) -> bool:
         """Let a connection in, or not."""
@@ -48,12 +50,23 @@ class Guests:
             return False
         seat.row[CONNECTIONS] += 1
         seat.row[peer] += 1
+        self._here += 1
         return True
 
     def leave(self, address: str) -> None:
         """Take note that a connection that was let in has ended."""
         self._seat.row[CONNECTIONS] -= 1
         self._seat.row[self._seat.peer(address)] -= 1
+        self._here -= 1
+        self._left.set()
+
+    async def gone(self, seconds: float) -> None:
+        """Wait until everybody whom this worker let in has left, but no longer than that."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                while self._here:
+                    self._left.clear()
+                    await self._left.wait()
 
 
 class Connection(web.RequestHandler):
@@ -171,14 +184,20 @@ async def serving(
     app = make_app(config, seat=seat, **app_options)
     runner = web.AppRunner(app, shutdown_timeout=config.grace, auto_decompress=False)
     await runner.setup()
+    guests = Guests(config.connections, config.per_address, seat)
+    loop = asyncio.get_running_loop()
+    stopped = loop.time()
     try:
-        server = await _listen(runner, config, seat, tls=tls, share_port=share_port)
+        server = await _listen(runner, config, guests, tls=tls, share_port=share_port)
         try:
             yield address_of(config, server.sockets[0].getsockname()[1])
         finally:
             server.close()
+            stopped = loop.time()
     finally:
         await runner.cleanup()
+        # The last bytes of a reply may still be in a transport's buffer, which ends with the loop.
+        await guests.gone(stopped + config.grace - loop.time())
 
 
 def address_of(config: ServeConfig, port: int) -> str:
@@ -210,12 +229,11 @@ def tls_context(config: ServeConfig) -> ssl.SSLContext | None:
 
 
 async def _listen(
-    runner: web.AppRunner, config: ServeConfig, seat: Seat, *, tls: ssl.SSLContext | None, share_port: bool
+    runner: web.AppRunner, config: ServeConfig, guests: Guests, *, tls: ssl.SSLContext | None, share_port: bool
 ) -> asyncio.Server:
     loop = asyncio.get_running_loop()
     manager = runner.server
     assert manager is not None
-    guests = Guests(config.connections, config.per_address, seat)
     logger_class = ledger_of(runner.app).logger_class()
 
     def connection() -> Connection:

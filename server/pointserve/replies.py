@@ -25,7 +25,8 @@ SMALL = 256 * 1024
 
 LARGE = 4 * 1024 * 1024
 """Parts from here on go through sendfile: it spares copies, but each call waits for the socket to drain, which below
-this size costs more than the copies do (benchmarks/serve.py)."""
+this size costs more than the copies do (benchmarks/serve.py). What it has under way are the file's own pages: where
+a file is cut short in place they read as zeros, until the connection is closed for it."""
 
 PIECE = 1024 * 1024
 """What one call of sendfile is given, so that a stalled reader is noticed between two."""

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from lpc.octahedral import decode_normals, encode_normals, fold_codes, max_error_degrees, unfold_codes
+from lpc.octahedral_compiled import unit_vectors
 
 ENGINES = ("compiled", "numpy")
 
@@ -61,6 +62,14 @@ def test_engines_agree(bits: int) -> None:
     compiled, plain = (encode_normals(normals, bits, engine=engine) for engine in ("compiled", "numpy"))
     assert compiled.dtype == plain.dtype == (np.uint8 if bits <= 8 else np.uint16)
     np.testing.assert_array_equal(compiled, plain)
+
+
+@pytest.mark.parametrize("bits", range(2, 17))
+def test_engines_decode_alike(bits: int) -> None:
+    most = (1 << bits) - 2
+    codes = np.random.default_rng(bits).integers(0, most + 1, (5000, 2)).astype(np.uint16)
+    codes[:4] = [[0, 0], [0, most], [most, 0], [most // 2, most // 2]]
+    np.testing.assert_array_equal(unit_vectors(codes, bits), decode_normals(codes, bits))
 
 
 @given(arrays(np.float64, (6, 3), elements=st.floats(allow_subnormal=True)))

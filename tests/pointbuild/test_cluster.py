@@ -53,8 +53,8 @@ class Killing(Silent):
 @pytest.fixture(scope="module")
 def points() -> PointBatch:
     dense = surfaces.bumpy(9000, seed=1, color=True)
-    pile = PointBatch.concatenate([dense.take(slice(5, 6))] * 900)
-    return PointBatch.concatenate([dense, pile])
+    pile = dense.take(slice(0, 900))  # all at one place, but unlike each other
+    return PointBatch.concatenate([dense, PointBatch(np.tile(dense.xyz[5], (900, 1)), pile.attributes)])
 
 
 @pytest.fixture(scope="module")

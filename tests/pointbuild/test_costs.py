@@ -31,7 +31,10 @@ def test_the_total_is_the_whole_file_and_the_parts_add_up(n: int, tmp_path: Path
     check(built.header, len(built.data))
     bits = dict(built.header.bits_per_sample)
     total = bits.pop("total")
-    assert sum(bits.values()) == pytest.approx(total, abs=1e-3)
+    assert sum(bits.values()) == pytest.approx(total, abs=1e-8)
+    by_name = built.header.attribute_bits
+    assert by_name.keys() == {attribute.name for attribute in built.header.attributes}
+    assert sum(by_name.values()) == pytest.approx(bits["normal"] + bits["color"] + bits["other"], abs=1e-8)
     outside = len(built.data) - int(built.index.size.sum())
     assert bits["index"] == pytest.approx(8 * outside / n, abs=0.01)
 

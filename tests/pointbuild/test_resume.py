@@ -208,7 +208,7 @@ def test_what_was_done_is_not_done_again(
         assert done.count("_partition_bucket") == 2 * len(whole.steps["partition"]) - steps
 
 
-@pytest.mark.parametrize("what", ["seed", "scan", "version", "restart", "torn"])
+@pytest.mark.parametrize("what", ["seed", "color_bits", "scan", "version", "restart", "torn"])
 def test_files_of_another_build_are_not_gone_on_with(
     what: str, scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -218,6 +218,8 @@ def test_files_of_another_build_are_not_gone_on_with(
     chosen = options()
     if what == "seed":
         chosen = replace(chosen, seed=1)
+    elif what == "color_bits":
+        chosen = replace(chosen, color_bits=5)
     elif what == "scan":
         np.savez(mine, xyz=surfaces.bumpy(900, seed=9).xyz)
     elif what == "version":

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pointstream.arrivals import Assembly
+from pointstream.offers import Item
 from pointstream.recovery import Recovery, RecoveryOptions
-from pointstream.scheduler import Item
 from pointstream.wanted import Wanted
 
 FILE = random.Random(1).randbytes(2000)

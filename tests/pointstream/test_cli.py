@@ -86,6 +86,22 @@ def test_verify_says_ok_or_what_is_wrong(path: Path, tmp_path: Path, capsys: pyt
     assert run(capsys, "verify", tmp_path / "cut.lpc")[0] == 1
     facts = json.loads(run(capsys, "info", tmp_path / "cut.lpc", "--json")[1])
     assert facts["complete"] is False
+    assert facts["here"] == {"samples": report_samples(tmp_path / "cut.lpc"), "clouds": report["clouds_checked"]}
+    assert facts["samples"] == 20_000
+    out = run(capsys, "info", tmp_path / "cut.lpc")[1]
+    assert f"{facts['here']['samples']:,} of the samples" in " ".join(out.split())
+
+
+def report_samples(path: Path) -> int:
+    with pointstream.open(str(path)) as model:
+        return len(model.read())
+
+
+def test_a_part_without_samples_is_no_file(path: Path, tmp_path: Path, capsys: Any) -> None:
+    status, _, err = run(capsys, "export", path, tmp_path / "out.ply", "--bounds", "0,0,0,1,1,1")
+    assert status == 1
+    assert "no sample" in err.splitlines()[-1]
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("suffix", ["ply", "npz", "laz", "xyz"])

@@ -5,17 +5,22 @@ from __future__ import annotations
 import asyncio
 import time
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import httpx
 import pytest
 from support.hosts import reply
+from support.servers import serve_in_thread
 from support.shelf import HEADER
 
 from lpc.errors import StoreError, Unavailable
-from pointstream.doctor import Finding, Observations, Seen, can_serve, diagnose
+from pointstream import command
+from pointstream.doctor import Finding, Observations, Seen, advisable, can_serve, diagnose
 from pointstream.probe import ProbeOptions, probe
 from pointstream.remedies import RECIPES, recipes_for
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 LENGTH = HEADER.bytes
 CORS = {
@@ -73,10 +78,6 @@ def test_a_good_host_has_only_good() -> None:
     ("first", "words"),
     [
         (Seen(status=200, headers={"content-length": "77"}), "whole file comes (77 bytes)"),
-        (Seen(status=404, headers={}), "nothing stands there"),
-        (Seen(status=401, headers={}), "token"),
-        (Seen(status=302, headers={}), "elsewhere"),
-        (Seen(status=503, headers={}), "it fails"),
         (without(GOOD.first, **{"content-encoding": "gzip"}), "coded as gzip"),
         (without(GOOD.first, "content-range"), "no Content-Range"),
         (without(GOOD.first, **{"content-range": "bytes nonsense"}), "means nothing"),
@@ -91,6 +92,33 @@ def test_what_stands_in_the_way_is_a_failure(first: Seen, words: str) -> None:
     assert not can_serve(findings)
     assert [finding.topic for finding in findings if finding.level == "failure"] == ["ranges"]
     assert words in findings[0].text
+
+
+@pytest.mark.parametrize(
+    ("status", "words"), [(404, "nothing stands there"), (401, "token"), (302, "elsewhere"), (503, "it fails")]
+)
+def test_where_nothing_is_served_nothing_is_advised(status: int, words: str) -> None:
+    findings = diagnose(Observations(address="http://host/x.lpc", first=Seen(status=status, headers={})))
+    assert not can_serve(findings)
+    assert not advisable(findings)
+    (finding,) = findings
+    assert (finding.topic, finding.level) == ("address", "failure")
+    assert words in finding.text
+
+
+def test_a_missing_model_brings_no_lines_of_configuration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with serve_in_thread(tmp_path) as url:
+        assert command.run(["doctor", f"{url}/no.lpc"]) == 1
+    out = capsys.readouterr().out
+    assert "404: nothing stands there" in out
+    assert "address of one" in out
+    assert "Access-Control" not in out
+
+
+@pytest.mark.parametrize("url", ["foo", "ftp://host/x.lpc", "http://", "http://host:port/x"])
+def test_what_is_no_address_is_a_wrong_argument(url: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command.run(["doctor", url]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 def test_a_file_that_is_no_model_is_a_failure_of_its_own() -> None:

@@ -129,6 +129,8 @@ def test_a_file_cut_short_gives_what_it_has(
     index, parts = clouds
     with pointstream.open(str(tmp_path / "cut.lpc")) as cut:
         assert not cut.info["complete"]
+        here = np.flatnonzero(index.available(length))
+        assert cut.info["here"] == {"samples": int(index.samples[here].sum()), "clouds": len(here)}
         points = cut.read()
     same(points, PointBatch.concatenate(parts[n] for n in np.flatnonzero(index.available(length))))
 

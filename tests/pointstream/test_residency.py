@@ -13,6 +13,7 @@ NODES = 12
 steps = st.lists(
     st.one_of(
         st.tuples(st.just("add"), st.integers(0, NODES - 1), st.integers(1, 40)),
+        st.tuples(st.just("ahead"), st.integers(0, NODES - 1), st.integers(1, 40)),
         st.tuples(st.just("pin"), st.sets(st.integers(0, NODES - 1), max_size=5), st.just(0)),
     ),
     max_size=60,
@@ -20,12 +21,12 @@ steps = st.lists(
 
 
 class Obvious:
-    """Least recently touched first, deepest first among equals, down to the low-water mark."""
+    """Never drawn first, then least recently touched, deepest first among equals, down to the low-water mark."""
 
     def __init__(self, capacity: int, slack: int) -> None:
         self.capacity, self.low = capacity, capacity - capacity // slack
         self.size: dict[int, int] = {}
-        self.touched: dict[int, int] = {}
+        self.touched: dict[int, tuple[bool, int]] = {}
         self.pinned: set[int] = set()
         self.tick = 0
 
@@ -43,13 +44,20 @@ class Obvious:
 
     def add(self, node: int, size: int) -> list[int]:
         self.tick += 1
-        self.size[node], self.touched[node] = size, self.tick
+        self.size[node], self.touched[node] = size, (True, self.tick)
         return self.evict(node)
+
+    def ahead(self, node: int, size: int) -> list[int]:
+        if sum(self.size.values()) + size > self.capacity:
+            return [node]
+        self.tick += 1
+        self.size[node], self.touched[node] = size, (False, self.tick)
+        return []
 
     def pin(self, nodes: set[int]) -> list[int]:
         self.tick += 1
         self.pinned = nodes
-        self.touched.update(dict.fromkeys(nodes, self.tick))
+        self.touched.update(dict.fromkeys(nodes, (True, self.tick)))
         return self.evict(-1)
 
 
@@ -61,6 +69,12 @@ def test_same_as_the_obvious_one(steps: list[tuple[str, object, int]], capacity:
             assert isinstance(what, int)
             assert residency.add(what, size) == obvious.add(what, size)
             assert residency.resident[what]
+        elif kind == "ahead":
+            assert isinstance(what, int)
+            if not residency.resident[what]:
+                drawn = residency.resident.copy()
+                assert residency.add(what, size, ahead=True) == obvious.ahead(what, size)
+                assert (residency.resident >= drawn).all(), "something went for what nobody wants yet"
         else:
             assert isinstance(what, set)
             nodes = np.array(sorted(node for node in what if residency.resident[node]), dtype=np.int64)

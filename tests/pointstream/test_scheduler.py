@@ -13,7 +13,8 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 from support.fifo import Fifo
 
 from pointstream.goodput import Goodput
-from pointstream.scheduler import LinkState, Request, Scheduler, SchedulerOptions
+from pointstream.offers import Request
+from pointstream.scheduler import LinkState, Scheduler, SchedulerOptions
 
 ADSL = LinkState(156_250.0, 0.05, measured=True)
 

@@ -50,8 +50,11 @@ def test_no_holes(scene, one_sided):
     assert np.mean(shares) <= 0.0005
 
 
-def test_silhouettes_grow_by_less_than_half_the_spacing(scene):
+@pytest.mark.parametrize("normals", [True, False])
+def test_silhouettes_grow_by_less_than_half_the_spacing(scene, normals):
     model, camera, exact = scene
+    if not normals:
+        model = (models.sphere if model.header.bounds[5] > 0.5 else models.torus)(60_000, cloud_size=512, normals=False)
     backend = CpuBackend(model.header)
     for tolerance, resident in residents(model):
         cut = refine(model.index, camera, tolerance, resident)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from oracles import surfaces
@@ -10,7 +12,7 @@ from support import models
 from lpc.attributes import Attribute
 from lpc.points import PointBatch
 from pointview.camera import Camera
-from pointview.colouring import CLASSES, MODES, Colouring, available_modes, class_table, ramp
+from pointview.colouring import CLASSES, MODES, Colouring, available_modes, class_name, class_table, ramp
 from pointview.refine import refine
 from pointview.render.backend import Style
 from pointview.render.cpu import CpuBackend
@@ -87,6 +89,34 @@ def test_classes_have_their_names_and_colours(scan):
     shown = np.unique(np.concatenate([colours.colors(n, c) for n, c in enumerate(scan.clouds)]), axis=0)
     assert {tuple(color) for color in shown.tolist()} == {CLASSES[2][1], CLASSES[6][1]}
     assert len(class_table()) == 256
+
+
+def test_the_legend_names_the_classes_that_were_coloured(scan):
+    """The root is a sample: what is rare may come later."""
+    colours = Colouring("classification", scan.header, scan.index, None)
+    assert colours.legend.entries == ()
+    rare = np.full(len(scan.clouds[1]), 65, dtype=np.uint8)
+    attribute = next(each for each in scan.header.attributes if each.name == "classification")
+    cloud = replace(scan.clouds[1], codes={**scan.clouds[1].codes, "classification": rare})
+    colours.colors(1, cloud)
+    code = int(attribute.decode(rare)[0])
+    assert [text for text, _ in colours.legend.entries] == [f"{code} {class_name(code)}"]
+    for node, each in enumerate(scan.clouds):
+        colours.colors(node, each)
+    assert len(colours.legend.entries) == 3
+    assert (class_name(2), class_name(40), class_name(65)) == ("ground", "reserved", "user defined")
+
+
+def test_height_follows_the_axis_that_is_up(scan):
+    colours = Colouring("height", scan.header, scan.index, scan.clouds[0], up=2)
+    assert "z" in colours.legend.title
+    assert (colours.legend.low, colours.legend.high) == (scan.header.bounds[2], scan.header.bounds[5])
+
+
+def test_the_legend_has_every_level_once(scan):
+    entries = colouring(scan, "level").legend.entries
+    levels = sorted(int(level) for text, _ in entries for level in text.split(", "))
+    assert levels == list(range(scan.header.levels))
 
 
 def test_levels_differ_from_their_neighbours(scan):

@@ -22,7 +22,7 @@ def camera_at(eye, *, target=(0.0, 0.0, 0.0), width=90, height=70):
     return Camera(eye=eye, target=target, up=(0, 0, 1), fov_y=45.0, width=width, height=height)
 
 
-def paint(model, cut, camera, *, cull, oriented):
+def paint(model, cut, camera, *, cull, splat):
     """Depth and node of the foremost splat at every pixel centre, sample by sample in float64; and where two tie."""
     depth = np.full((camera.height, camera.width), np.inf)
     front = depth.copy()  # depth with the bulge
@@ -46,11 +46,11 @@ def paint(model, cut, camera, *, cull, oriented):
             here = behind = np.full(depth.shape, z[i])
             if side <= 1:
                 covered = (np.floor(column) == math.floor(pixel[i, 0])) & (np.floor(row) == math.floor(pixel[i, 1]))
-            elif side <= splats.ROUND_FROM:
+            elif side <= splats.ROUND_FROM or splat == "square":
                 covered = (np.abs(dx) <= side / 2) & (np.abs(dy) <= side / 2)
             else:
                 radius = side * splats.ROUND / 2 * z[i] / camera.focal
-                if oriented:
+                if splat == "disc":
                     toward = -inside[i] / np.linalg.norm(inside[i])
                     plane = camera.rotation() @ normals[i]
                     plane *= np.sign(plane @ toward) / np.linalg.norm(plane)
@@ -71,14 +71,14 @@ def paint(model, cut, camera, *, cull, oriented):
 @pytest.mark.parametrize(
     ("eye", "tolerance"), [((0, -3, 1), 1.0), ((0, -3, 1), 12.0), ((0.2, -12, 3), 1.0), ((0, -0.5, 0.1), 4.0)]
 )
-@pytest.mark.parametrize(("cull", "oriented"), [(True, True), (False, True), (False, False)])
-def test_agrees_with_the_painter(eye, tolerance, cull, oriented):
+@pytest.mark.parametrize(("cull", "splat"), [(True, "disc"), (False, "disc"), (False, "round"), (True, "square")])
+def test_agrees_with_the_painter(eye, tolerance, cull, splat):
     model = models.sphere(1500, cloud_size=100)
     camera = camera_at(eye)
-    style = Style(two_sided=not cull, oriented=oriented, close_holes=False)
+    style = Style(two_sided=not cull, splat=splat, close_holes=False)
     cut = refine(model.index, camera, tolerance, model.everything, cull_backfaces=cull)
     frame = CpuBackend(model.header).draw(cut, model.take, camera, style)
-    depth, node, tied = paint(model, cut, camera, cull=cull, oriented=oriented)
+    depth, node, tied = paint(model, cut, camera, cull=cull, splat=splat)
     different = np.isfinite(depth) != np.isfinite(frame.depth)
     both = np.isfinite(depth) & np.isfinite(frame.depth) & ~tied
     assert both.sum() > 100 or (cull and math.hypot(*eye) < 1)
@@ -252,7 +252,7 @@ def test_survey_coordinates_do_not_jitter(at):
     eye = (at[0], at[1] - 0.12, at[2])
     camera = camera_at(eye, target=at, width=200, height=200)
     cut = refine(model.index, camera, 1.0, model.everything, cull_backfaces=False)
-    frame = CpuBackend(model.header).draw(cut, model.take, camera, Style(oriented=False))
+    frame = CpuBackend(model.header).draw(cut, model.take, camera, Style(splat="round"))
     z = np.concatenate([camera.project(model.positions(node))[1] for node in cut.nodes.tolist()])
     drawn = np.unique(frame.depth[frame.node >= 0].astype(np.float64))
     nearest = np.abs(np.sort(z)[np.clip(np.searchsorted(np.sort(z), drawn), 1, len(z) - 1)] - drawn)

@@ -6,11 +6,15 @@ equal to 2 of 255 levels. Which of two samples at equal depth is seen may differ
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
-from support import models
+from support import models, shells
 
 from lpc.errors import Unavailable
+from pointbuild import BuildOptions, build_model
+from pointbuild.arrays import ArrayScan
 from pointview.camera import Camera
 from pointview.refine import refine
 from pointview.render import Style, open_backend
@@ -33,12 +37,20 @@ def gl():
     return GlBackend
 
 
-@pytest.fixture(scope="module", params=["normals", "normals and colours", "colours", "nothing", "survey coordinates"])
-def scene(request):
+SCENES = ["normals", "normals and colours", "colours", "nothing", "survey coordinates", "uneven"]
+
+
+@pytest.fixture(scope="module", params=SCENES)
+def scene(request, tmp_path_factory):
     eye, target = np.array([1.0, -2.5, 2.0]), np.zeros(3)
     if request.param == "survey coordinates":
         target = np.array([512_345.0, 6_012_345.0, 123.0])
         model = models.sphere(8000, at=tuple(target), color=True)
+    elif request.param == "uneven":
+        path = tmp_path_factory.mktemp("model") / "uneven.lpc"
+        points = shells.sample(shells.TORUS, "fading", 8000, normals=False)
+        build_model([ArrayScan(points)], path, BuildOptions(threads=1, cloud_size=128), clock=time.monotonic)
+        model = models.load(path.read_bytes())
     else:
         model = models.torus(8000, normals="normals" in request.param, color="colours" in request.param)
     camera = Camera(eye=tuple(target + eye), target=tuple(target), up=(0, 0, 1), width=161, height=120)
@@ -77,6 +89,36 @@ def test_the_cpu_picture(gl, scene, one_draw, two_sided):
     backend.close()
 
 
+@pytest.mark.parametrize("splat", ["square", "round"])
+def test_other_splats(gl, scene, splat):
+    model, camera = scene
+    style, backend, oracle = Style(splat=splat), gl(model.header), CpuBackend(model.header)
+    for tolerance in (1.0, 6.0):
+        cut = refine(model.index, camera, tolerance, model.everything)
+        # They have nearly one depth: where many overlap, more of them tie in the 24 bits of a depth buffer, and the
+        # first one drawn stays. How often it is the nearest depends on the order of the samples in their clouds.
+        expected = oracle.draw(cut, model.take, camera, style)
+        assert_same(backend.draw(cut, model.take, camera, style), expected, 8 * SHARE)
+    backend.close()
+
+
+@pytest.mark.parametrize("one_draw", [True, False])
+def test_blended_pictures(gl, scene, one_draw):
+    model, camera = scene
+    backend, oracle = gl(model.header, one_draw=one_draw), CpuBackend(model.header)
+    for tolerance, resident, two_sided in (
+        (1.0, model.everything, False),
+        (6.0, model.everything, True),
+        (1.0, model.first(7), False),
+    ):
+        style = Style(splat="blended", two_sided=two_sided, background=(30, 60, 90))
+        cut = refine(model.index, camera, tolerance, resident, cull_backfaces=not two_sided)
+        frame, expected = (one.draw(cut, model.take, camera, style) for one in (backend, oracle))
+        # Another sample that is seen lies at another depth, and lets others count around it.
+        assert_same(frame, expected, 3 * SHARE)
+    backend.close()
+
+
 def test_inside_the_model(gl):
     model = models.torus(8000)
     camera = Camera(eye=(1.0, 0.02, 0.03), target=(1.0, 1.0, 0.2), up=(0, 0, 1), width=120, height=90)
@@ -101,6 +143,9 @@ def test_a_small_arena_gives_the_same_picture_in_several_passes(gl):
         frame = small.draw(cut, model.take, camera, Style())
         np.testing.assert_array_equal(frame.rgb, expected.rgb)
         np.testing.assert_array_equal(frame.node, expected.node)
+    blended = [backend.draw(cut, model.take, camera, Style(splat="blended")).rgb for backend in (small, large)]
+    assert (blended[0] != expected.rgb).any()
+    np.testing.assert_array_equal(*blended)
     small.close()
     large.close()
 

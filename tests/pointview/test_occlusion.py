@@ -81,6 +81,32 @@ def test_pixels_are_counted_in_the_cells_around_them(onion):
         np.testing.assert_allclose(counts[number], expected, atol=on_edge.sum() + 3)
 
 
+def test_a_part_of_the_pixels_counts_as_many_for_each_cell(onion):
+    viewer, camera = Viewer(onion), camera_at((0.4, -2.5, 1.0))
+    cut = viewer.cut(camera, culled=False)
+    frame = viewer.draw(cut, camera)
+    every, quarter = (pixels_by_cell(frame.depth, cut, camera, stride=stride) for stride in (1, 2))
+    large = every > 400
+    np.testing.assert_allclose(4 * quarter[large], every[large], rtol=0.15)
+    assert (quarter[every == 0] == 0).mean() > 0.99
+
+
+def test_a_fine_picture_is_tried_although_a_coarse_one_hid_nothing():
+    model = models.sphere(6000, cloud_size=64)
+    viewer, camera = Viewer(model), camera_at((0, -3, 0))
+    backend = CpuBackend(model.header)
+    for tolerance in (9.0, 2.0):
+        for _ in range(2 * TRIAL + KEPT):
+            cut = refine(model.index, camera, tolerance, model.everything, hidden=viewer.occlusion.hidden)
+            viewer.occlusion.look(model.index, cut, camera, backend.draw(cut, model.take, camera, STYLE))
+            if viewer.occlusion.verdict is not None:
+                break
+        assert viewer.occlusion.verdict is not None
+        fine = refine(model.index, camera, 2.0, model.everything)
+        viewer.occlusion.look(model.index, fine, camera, backend.draw(fine, model.take, camera, STYLE))
+        assert (viewer.occlusion.verdict is None) == (tolerance == 9.0)
+
+
 def test_hidden_nodes_are_left_out_and_the_picture_stays(onion):
     viewer, camera = Viewer(onion), camera_at((0.4, -2.5, 1.0))
     full = viewer.cut(camera, culled=False)

@@ -64,6 +64,16 @@ def test_colours_of_any_depth(bits, dtype, shift):
     np.testing.assert_array_equal(packed.color[:, :3], codes >> shift)
 
 
+@pytest.mark.parametrize(("depth", "bits"), [(8, 5), (8, 1), (16, 6), (12, 9)])
+def test_colours_that_lost_bits_are_as_bright_as_they_were(depth, bits):
+    attribute = Attribute(name="color", kind="color", dtype="<u2", bits=bits, depth=depth)
+    codes = np.random.default_rng(2).integers(0, 1 << bits, (50, 3)).astype(np.uint16)
+    codes[0] = (1 << bits) - 1
+    packed = Packer(header(attribute)).pack(cloud(color=codes), 100)
+    assert packed.color[:, :3].max() == 255
+    np.testing.assert_array_equal(packed.color[:, :3], attribute.decode(codes) >> (depth - 8))
+
+
 def test_a_cloud_that_is_too_large_is_cut():
     assert len(Packer(header()).pack(cloud(), 20).vertex) == 20
 

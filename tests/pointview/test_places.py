@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support import models, placed
+from support import models, placed, shells
 
+from pointbuild import BuildOptions, build_model
+from pointbuild.arrays import ArrayScan
 from pointbuild.cells import Cells
 from pointview import splats
 from pointview.camera import Camera
@@ -103,3 +107,52 @@ def test_the_rule_of_the_paper(ring):
     refined = ~cut.starved & (gap > 0) & (own * CAMERA.focal / gap > 2.0)
     assert refined.any()
     np.testing.assert_allclose((cut.spacing * CAMERA.focal / gap)[refined], 2.0, rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def fading(tmp_path_factory):
+    """A torus whose one end is a hundred times denser than the other, as the build writes it."""
+    path = tmp_path_factory.mktemp("model") / "fading.lpc"
+    points = shells.sample(shells.TORUS, "fading", 30_000, normals=False)
+    build_model([ArrayScan(points)], path, BuildOptions(threads=1, cloud_size=128), clock=time.monotonic)
+    return models.load(path.read_bytes())
+
+
+@pytest.mark.parametrize("nodes", [1, 6, 40])
+def test_thin_parts_of_a_cell_grow_where_nothing_of_them_is_here(fading, nodes):
+    """At every sample the table says what walking down the tree says."""
+    index, density = fading.index, fading.index.density
+    cut = refine(index, CAMERA, 0.5, fading.first(nodes), cull_backfaces=False)
+    places, rows = cut.places, {node: row for row, node in enumerate(cut.nodes.tolist())}
+    assert len(places.link) > len(cut.nodes)
+    ratios = []
+    for sample in np.concatenate([fading.positions(node) for node in cut.nodes.tolist()])[::7]:
+        node, path = 0, []
+        while True:  # to the deepest drawn node
+            box, axis = placed.cell_of(fading.header, path)
+            half = int(sample[axis] >= box[:, axis].mean())
+            child = int(index.children[node][half])
+            if child not in rows:
+                break
+            node, path = child, [*path, half]
+        spacing, drawn, cell = index.spacing[node], node, node
+        while density.uneven[cell] and (child := int(index.children[cell][half])) >= 0:
+            cell, path = child, [*path, half]
+            spacing = density.full[cell] / np.sqrt(density.drawn[drawn])
+            box, axis = placed.cell_of(fading.header, path)
+            half = int(sample[axis] >= box[:, axis].mean())
+        ratios.append(spacing / found(places, rows[drawn], index.level[drawn], sample))
+    # Cells whose samples are less than a pixel apart are not looked into.
+    assert np.median(ratios) == pytest.approx(1.0, rel=1e-5)
+    assert np.mean(np.isclose(ratios, 1.0, rtol=1e-4)) > 0.95
+
+
+def found(places, row, level, sample):
+    """Spacing of a table of places at a sample of a drawn node."""
+    at = sample - places.corner[row]
+    while row >= 0:
+        axis = places.axis[level]
+        half = int(at[axis] >= places.half[level])
+        at[axis] -= half * places.half[level]
+        row, spacing, level = places.link[row][half], places.spacing[row][half], level + 1
+    return abs(spacing)

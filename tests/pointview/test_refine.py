@@ -74,7 +74,7 @@ def recursion(model, camera, tolerance, resident, known, cull_backfaces):
                 else:
                     wants.append(child)
                     starved = True
-        drawn[node] = (starved, own if starved else min(shown, own))
+        drawn[node] = (starved, max(shown, own) if starved else shown)
         return drawn[node][1]
 
     if visible(0):
@@ -246,6 +246,7 @@ class Unread:
             "cone_angle",
             "children",
             "parent",
+            "density",
         ):
             values = getattr(index, name)
             if isinstance(values, np.ndarray):

@@ -49,6 +49,47 @@ def test_a_path_becomes_numbered_pictures_and_a_film(model_file, tmp_path, capsy
         assert (film.n_frames, film.size) == (5, (80, 60))
 
 
+def test_a_turntable_of_blended_and_of_antialiased_pictures(model_file, tmp_path, capsys):
+    shown = []
+    for options in ((), ("--splat", "blended"), ("--antialias", 2)):
+        render(capsys, model_file, tmp_path / "o.png", "--turntable", 2, "--animation", "none", *options)
+        shown.append(np.asarray(Image.open(tmp_path / "o-0002.png")).tobytes())
+    assert len(set(shown)) == 3
+
+
+ITS_PIPES = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+"""imageio-ffmpeg leaves pipes open."""
+
+
+@ITS_PIPES
+@pytest.mark.parametrize("size", ["80x60", "81x61"])
+def test_a_film_in_mp4_shows_the_pictures(model_file, tmp_path, capsys, size):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    capsys.readouterr()
+    arguments = ["render", model_file, tmp_path / "o.png", "--turntable", 6, "--fps", 3, "--size", size, "--json"]
+    assert command([*map(str, arguments)]) == 0
+    assert json.loads(capsys.readouterr().out)["animation"] == "o.mp4"
+    frames = ffmpeg.read_frames(str(tmp_path / "o.mp4"))
+    facts = next(frames)
+    assert (facts["fps"], facts["duration"], facts["codec"]) == (3.0, 2.0, "h264")
+    width, height = facts["size"]
+    shown = [np.frombuffer(data, dtype=np.uint8).reshape(height, width, 3).astype(int) for data in frames]
+    assert len(shown) == 6
+    for number, picture in enumerate(shown, 1):
+        drawn = np.asarray(Image.open(tmp_path / f"o-000{number}.png")).astype(int)
+        assert (width - drawn.shape[1], height - drawn.shape[0]) == (drawn.shape[1] % 2, drawn.shape[0] % 2)
+        assert np.abs(picture[: drawn.shape[0], : drawn.shape[1]] - drawn).mean() < 6  # H.264 has its losses
+
+
+@ITS_PIPES
+def test_a_film_that_cannot_be_written_is_one_line(model_file, tmp_path, capsys):
+    pytest.importorskip("imageio_ffmpeg")
+    (tmp_path / "o.mp4").mkdir()
+    arguments = ["render", str(model_file), str(tmp_path / "o.png"), "--turntable", "2", "--animation", "mp4"]
+    assert command([*arguments, "--size", "80x60"]) == 1
+    assert capsys.readouterr().err.splitlines()[-1].startswith("pointstream: cannot write")
+
+
 def test_each_picture_is_that_of_its_view(model_file, tmp_path, capsys):
     path, still = tmp_path / "path.json", tmp_path / "view.json"
     path.write_text(json.dumps([{"t": 0, **view(-2)}, {"t": 1, **view(2)}]))

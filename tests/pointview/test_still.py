@@ -62,6 +62,24 @@ def test_view_tolerance_and_sides(model_file, tmp_path):
     assert both["culled"]["backface"] == 0
 
 
+def test_kinds_of_splats_and_samples_a_pixel(model_file, tmp_path):
+    pictures = []
+    for options in ("square", "round", "disc", "blended"):
+        out = tmp_path / f"{options}.png"
+        result = run(model_file, out, "--size", "80x60", "--tolerance", "3", "--splat", options)
+        assert result.exit_code == 0, result.output
+        pictures.append(np.asarray(Image.open(out)))
+    for options in (("--antialias", "2"), ("--antialias", "3", "--splat", "blended")):
+        out = tmp_path / "fine.png"
+        assert run(model_file, out, "--size", "80x60", "--tolerance", "3", *options).exit_code == 0
+        pictures.append(np.asarray(Image.open(out)))
+    assert all(picture.shape == (60, 80, 3) for picture in pictures)
+    assert len({picture.tobytes() for picture in pictures}) == len(pictures)
+    refused = run(model_file, tmp_path / "a.png", "--size", "9000x10", "--antialias", "2")
+    assert refused.exit_code == 2
+    assert "above 16384 pixels" in refused.output
+
+
 @pytest.mark.parametrize("budget", [600, 5000, 12_000])
 def test_a_budget_is_kept(model_file, tmp_path, budget):
     report = json.loads(run(model_file, tmp_path / "a.png", "--budget", budget, "--json").stdout)

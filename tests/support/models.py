@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from oracles import surfaces
@@ -53,6 +53,11 @@ def build(
     points: PointBatch, spacing: float, *, cloud_size: int = 256, crs: str | None = None, normal_bits: int = 8
 ) -> Model:
     data = build_bytes(points, cloud_size=cloud_size, spacing=spacing, crs=crs, page_nodes=64, normal_bits=normal_bits)
+    return load(data, engine="numpy")
+
+
+def load(data: bytes, engine: Literal["auto", "numpy"] = "auto") -> Model:
+    """Read a whole file."""
     header = parse_header(data)
     index = IndexTree(header)
     while not index.page_loaded.all():
@@ -67,7 +72,7 @@ def build(
                 data[where.start : where.stop],
                 samples=int(index.samples[node]),
                 schema=header.attributes,
-                engine="numpy",
+                engine=engine,
             )
         )
     return Model(header=header, index=index, clouds=clouds)

@@ -58,7 +58,7 @@ class HttpOptions:
         Leaving the host alone, of all ranges together.
     """
 
-    lanes: int = 8
+    lanes: int = 12
     headers: tuple[tuple[str, str], ...] = ()
     patience: PatienceOptions = field(default_factory=PatienceOptions)
     breaker: BreakerOptions = field(default_factory=BreakerOptions)

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Literal
 
 from lpc.errors import Unavailable
 
-from .backend import Backend, Frame, Style, Take
+from .backend import Backend, Frame, Splat, Style, Take
 from .cpu import CpuBackend
 
 if TYPE_CHECKING:
     from lpc.header import Header
 
-__all__ = ["Backend", "Frame", "Kind", "Style", "Take", "open_backend"]
+__all__ = ["Backend", "Frame", "Kind", "Splat", "Style", "Take", "open_backend"]
 
 Kind = Literal["auto", "gl", "cpu"]
 

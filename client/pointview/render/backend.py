@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,6 +19,12 @@ Take = Callable[[int], "Cloud"]
 
 Rgb = tuple[int, int, int]
 
+Splat = Literal["square", "round", "disc", "blended"]
+"""What a splat of more than a few pixels is: a square of pixels as in the paper, a disc that faces the eye, or a disc
+in the tangent plane of its sample where there is a normal. Blended: such discs, and the mean of all samples that a
+pixel shows instead of the nearest one.
+"""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Style:
@@ -32,8 +38,8 @@ class Style:
         Colour of models that carry none.
     two_sided : bool
         Light both sides of a surface and drop no sample that faces away: for normals that may point inward.
-    oriented : bool
-        Draw samples with normals as discs in their tangent plane; False: as discs that face the eye.
+    splat : {"square", "round", "disc"}
+        See `Splat`.
     close_holes : bool
         Paint pixels that a nearer surface encloses within a splat's width with that surface, see `splats`.
     edl_strength : float
@@ -43,7 +49,7 @@ class Style:
     background: Rgb = (18, 21, 26)
     surface: Rgb = (214, 208, 196)
     two_sided: bool = False
-    oriented: bool = True
+    splat: Splat = "disc"
     close_holes: bool = True
     edl_strength: float = 0.25
 

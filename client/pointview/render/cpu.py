@@ -13,9 +13,10 @@ import numpy as np
 
 from pointview import splats
 
-from . import kernels, picture_kernels, shading
+from . import kernels, picture_kernels, rules, shading, splat_kernels, tables
 from .arena import Arena
 from .backend import Frame, Style, Take
+from .blending import blend, linear_light
 from .pack import Packer
 from .seen import place_table
 
@@ -46,7 +47,7 @@ class CpuBackend:
         self._arena = Arena(header.nodes, max(1, min(header.nodes, FIRST_SAMPLES // self._samples)))
         self._vertex = np.empty((self._arena.slots * self._samples, 4), dtype=np.uint16)
         self._color = np.empty((self._arena.slots * self._samples, 4), dtype=np.uint8)
-        self._layers = np.empty((self._threads, 0, 0), dtype=np.uint64)
+        self._layers = np.empty((self._threads, 0), dtype=np.uint64)
 
     @property
     def name(self) -> str:
@@ -57,8 +58,10 @@ class CpuBackend:
         """Draw a cut."""
         uploads = self._upload(cut.nodes, take)
         shape = (camera.height, camera.width)
-        if self._layers.shape[1:] != shape:
-            self._layers = np.empty((self._threads, *shape), dtype=np.uint64)
+        padded = splat_kernels.padded(*shape)
+        if self._layers.shape[1] != padded:
+            self._layers = np.empty((self._threads, padded), dtype=np.uint64)
+        words, colors = self._vertex.view(np.uint64).ravel(), self._color.view(np.uint32).ravel()
         clouds, cloud_of_block = self._clouds(cut, camera)
         places, halvings = place_table(cut)
         view = self._view(cut, camera, style)
@@ -73,17 +76,17 @@ class CpuBackend:
         background = np.array(style.background, dtype=np.uint8)
 
         def splat(worker: int) -> None:
-            self._layers[worker] = kernels.EMPTY
+            self._layers[worker] = rules.EMPTY
             # Every `threads`-th cloud: neighbours in the array are neighbours in space, and cost alike.
             mine = np.ascontiguousarray(clouds[worker :: self._threads])
-            kernels.splat(self._layers[worker], self._vertex, mine, places, halvings, rotation, view)
+            splat_kernels.splat(self._layers[worker], words, mine, places, halvings, rotation, view)
 
         def rows(worker: int) -> tuple[int, int]:
             return camera.height * worker // self._threads, camera.height * (worker + 1) // self._threads
 
         def resolve(worker: int) -> None:
             kernels.resolve(
-                self._layers, *rows(worker), rgb, depth, node, side, starved, self._vertex, self._color, clouds,
+                self._layers, *rows(worker), rgb, depth, node, side, starved, words, colors, clouds,
                 cloud_of_block, places, halvings, rotation, view, light, albedo, background,
             )  # fmt: skip
 
@@ -105,6 +108,15 @@ class CpuBackend:
             walls = source.ravel()[holes]
             for image in (rgb.reshape(-1, 3), depth.ravel(), node.ravel(), side.ravel(), starved.ravel()):
                 image[holes] = image[walls]
+        if style.splat == "blended":
+            linear = linear_light()
+
+            def see(samples: NDArray[Any], some: NDArray[Any]) -> int:
+                return kernels.seen(
+                    samples, self._vertex, self._color, some, places, halvings, rotation, view, light, albedo, linear
+                )
+
+            blend(rgb, depth, clouds, see, focal=camera.focal, threads=self._threads, in_parallel=self._in_parallel)
         if not self._packer.has_normals and style.edl_strength > 0:
             self._in_parallel(dim)
         return Frame(
@@ -144,7 +156,7 @@ class CpuBackend:
         """Return the clouds of the frame, and the cloud that each block of places belongs to."""
         slots = self._arena.slots_of(cut.nodes)
         blocks = (self._arena.count[slots] >> kernels.BLOCK_BITS) + 1
-        clouds = np.empty(len(slots), dtype=kernels.CLOUD)
+        clouds = np.empty(len(slots), dtype=tables.CLOUD)
         clouds["node"] = cut.nodes
         clouds["first"] = slots * self._samples
         clouds["count"] = self._arena.count[slots]
@@ -161,20 +173,22 @@ class CpuBackend:
         return clouds, np.repeat(np.arange(len(slots), dtype=np.int32), blocks)
 
     def _view(self, cut: Cut, camera: Camera, style: Style) -> Any:
-        view = np.zeros(1, dtype=kernels.VIEW)[0]
+        view = np.zeros(1, dtype=tables.VIEW)[0]
         view["width"], view["height"], view["focal"] = camera.width, camera.height, camera.focal
         view["near"] = cut.depth_range[0]
-        view["largest"], view["round_from"], view["round"] = splats.LARGEST, splats.ROUND_FROM, splats.ROUND
+        view["largest"], view["round"] = splats.LARGEST, splats.ROUND
+        view["round_from"] = math.inf if style.splat == "square" else splats.ROUND_FROM
         view["bulge"], view["steepest"] = splats.BULGE, splats.STEEPEST
         view["closing"], view["reach"] = splats.CLOSING * camera.focal, splats.REACH
         view["cull"] = self._packer.has_normals and not style.two_sided
-        view["oriented"] = style.oriented
+        view["oriented"] = style.splat in ("disc", "blended")
         return view
 
     def _light(self, camera: Camera, style: Style) -> Any:
-        light = np.zeros(1, dtype=kernels.LIGHT)[0]
-        for name in ("ambient", "diffuse", "specular", "shininess", "unlit"):
+        light = np.zeros(1, dtype=tables.LIGHT)[0]
+        for name in ("ambient", "diffuse", "specular", "unlit"):
             light[name] = getattr(shading, name.upper())
+        light["squarings"] = round(math.log2(shading.SHININESS))
         light["lamp_x"], light["lamp_y"], light["lamp_z"] = shading.lamp() @ camera.rotation()
         light["lit"], light["two_sided"] = self._packer.has_normals, style.two_sided
         return light

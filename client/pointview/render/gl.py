@@ -24,6 +24,7 @@ from pointview import splats
 from . import shading
 from .arena import Arena
 from .backend import Frame, Style, Take
+from .blending import LEAST
 from .pack import SAMPLE_BYTES, Packer
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ STARVED = 1 << 30
 """Added to the row of a node that is starved everywhere."""
 
 PLACES_WIDTH = 1024
-"""Texels in a row of the texture of places: first one for each level, then one for each drawn node."""
+"""Texels in a row of the texture of places: first one for each level, then one for each of its rows."""
 
 
 class GlBackend:
@@ -107,21 +108,26 @@ class GlBackend:
 
     def draw(self, cut: Cut, take: Take, camera: Camera, style: Style) -> Frame:
         """Draw a cut."""
+        with self._context:  # another backend's may be current on this thread
+            return self._draw(cut, take, camera, style)
+
+    def _draw(self, cut: Cut, take: Take, camera: Camera, style: Style) -> Frame:
         self._resize(camera.width, camera.height)
         self._clear(style)
-        self._begin_splats(cut, camera, style)
         self._write_places(cut)
-        uploads = 0
-        for start in range(0, len(cut.nodes), self._arena.slots):
-            part = slice(start, start + self._arena.slots)
-            uploads += self._upload(cut.nodes[part], take)
-            self._submit(cut, part, camera)
+        self._splatted.target.use()
+        self._context.enable_only(moderngl.DEPTH_TEST | moderngl.PROGRAM_POINT_SIZE)
+        self._context.depth_func = "<"
+        uploads = self._draw_samples(self._splats, self._splatted.target, cut, take, camera, style)
         layers = self._splatted
         if style.close_holes:
             layers = self._close_holes(layers, camera)
-        picture = layers.target
+        picture, image = layers.target, layers.images["picture"]
+        if style.splat == "blended":
+            uploads += self._blend(layers, cut, take, camera, style)
+            picture, image = self._blended.picture, self._blended.image
         if not self._packer.has_normals and style.edl_strength > 0:
-            picture = self._eye_dome(layers, camera, style)
+            picture = self._eye_dome(image, layers, camera, style)
         return self._read(picture, layers, camera, cut, uploads)
 
     def close(self) -> None:
@@ -131,9 +137,6 @@ class GlBackend:
     def _build(self, slots: int) -> None:
         context = self._context
         defines = "#define COMMANDS\n" if self._one_draw else ""
-        self._program = context.program(
-            vertex_shader=_shader("splat.vert.glsl", defines), fragment_shader=_shader("splat.frag.glsl", defines)
-        )
         self._vertex = context.buffer(reserve=slots * self._samples * 8)
         self._color = context.buffer(reserve=slots * self._samples * 4)
         content: list[Any] = [(self._vertex, "4u2", "vertex"), (self._color, "4f1", "color")]
@@ -141,13 +144,17 @@ class GlBackend:
             self._placements = context.buffer(reserve=slots * PLACEMENT.itemsize)
             self._commands = context.buffer(reserve=slots * COMMAND.itemsize)
             content.append((self._placements, "4f 4f 4i /i", "cloud_origin", "cloud_corner", "cloud_numbers"))
-        self._points = context.vertex_array(self._program, content)
-        self._closer, self._dimmer = (
+        self._splats, self._kernels = (
+            _Samples(context, name, define, content)
+            for name, define in (("splat.frag.glsl", defines), ("blend.frag.glsl", f"{defines}#define BLENDED\n"))
+        )
+        self._closer, self._dimmer, self._mean = (
             context.program(vertex_shader=_shader("picture.vert.glsl"), fragment_shader=_shader(name))
-            for name in ("close_holes.frag.glsl", "eye_dome.frag.glsl")
+            for name in ("close_holes.frag.glsl", "eye_dome.frag.glsl", "mean.frag.glsl")
         )
         self._closing = context.vertex_array(self._closer, [])
         self._dimming = context.vertex_array(self._dimmer, [])
+        self._averaging = context.vertex_array(self._mean, [])
         self._size = (0, 0)
         self._places = context.texture((PLACES_WIDTH, 1), 4, dtype="f4")
 
@@ -159,6 +166,7 @@ class GlBackend:
             depth_buffer = context.depth_texture(size)
             self._splatted = _Layers(context, size, depth_buffer)
             self._closed = _Layers(context, size)
+            self._blended = _Sums(context, size)
             self._dimmed = context.framebuffer([context.texture(size, 4)])
         except moderngl.Error as error:
             raise Unavailable(f"OpenGL cannot draw {width}x{height} pixels: {_one_line(error)}") from error
@@ -169,36 +177,44 @@ class GlBackend:
         self._splatted.target.clear(red, green, blue, 1.0, depth=1.0)
         self._splatted.only_depth.clear(EMPTY, 0.0)  # moderngl clears all attachments of a target to one colour
 
-    def _begin_splats(self, cut: Cut, camera: Camera, style: Style) -> None:
-        target, margin = self._splatted.target, self._margin
-        target.use()
+    def _draw_samples(self, samples: _Samples, target: Any, cut: Cut, take: Take, camera: Camera, style: Style) -> int:
+        """Draw a cut into the target in use; return how many clouds had to be written."""
+        margin = self._margin
         # OpenGL drops a point whose centre is outside the viewport, even if its splat reaches in.
         target.viewport = (-margin, -margin, camera.width + 2 * margin, camera.height + 2 * margin)
-        self._context.enable_only(moderngl.DEPTH_TEST | moderngl.PROGRAM_POINT_SIZE)
-        self._context.depth_func = "<"
+        samples.tell(self._told(cut, camera, style))
+        uploads = 0
+        for start in range(0, len(cut.nodes), self._arena.slots):
+            part = slice(start, start + self._arena.slots)
+            uploads += self._upload(cut.nodes[part], take)
+            self._submit(samples, cut, part, camera)
+        return uploads
+
+    def _told(self, cut: Cut, camera: Camera, style: Style) -> dict[str, Any]:
+        """Return the uniforms of the shaders of samples."""
         near, far = cut.depth_range
         surface = (255, 255, 255) if self._packer.has_colors else style.surface
-        values: dict[str, Any] = {
+        return {
             "rotation": tuple(camera.rotation().T.ravel()),  # column by column
             "size": (camera.width, camera.height),
-            "margin": margin,
+            "margin": self._margin,
             "focal": camera.focal,
             "range": (near, 2 * far),  # the rim of a disc is behind its centre
             "largest": self._largest,
-            "round_from": splats.ROUND_FROM,
+            "round_from": self._largest if style.splat == "square" else splats.ROUND_FROM,
             "round_factor": splats.ROUND,
             "bulge": splats.BULGE,
             "steepest": splats.STEEPEST,
             "reach": splats.REACH,
             "closing": splats.CLOSING * camera.focal,
-            "oriented": style.oriented,
+            "oriented": style.splat in ("disc", "blended"),
             "albedo": tuple(channel / 255 for channel in surface),
             "lamp": tuple(shading.lamp().tolist()),
             "lit": self._packer.has_normals,
             "two_sided": style.two_sided,
+            "places": PLACES_UNIT,
+            "levels": 0 if cut.places is None else len(cut.places.axis),
         }
-        for name, value in values.items():
-            self._program[name].value = value
 
     def _upload(self, nodes: NDArray[np.int64], take: Take) -> int:
         absent, slots = self._arena.place(nodes)
@@ -217,21 +233,19 @@ class GlBackend:
         """Give the vertex shader the places of a cut: halvings (axis, half), then nodes (links, spacings)."""
         if cut.places is None:
             return
-        levels = len(cut.places.axis)
-        rows = -(-(levels + len(cut.nodes)) // PLACES_WIDTH)
+        levels, count = len(cut.places.axis), len(cut.places.link)
+        rows = -(-(levels + count) // PLACES_WIDTH)
         if self._places.height < rows:
             self._places.release()
             self._places = self._context.texture((PLACES_WIDTH, 1 << (rows - 1).bit_length()), 4, dtype="f4")
         texels = np.zeros((rows * PLACES_WIDTH, 4), dtype="<f4")
         texels[:levels, 0], texels[:levels, 1] = cut.places.axis, cut.places.half
-        texels[levels : levels + len(cut.nodes), :2] = cut.places.link
-        texels[levels : levels + len(cut.nodes), 2:] = cut.places.spacing
+        texels[levels : levels + count, :2] = cut.places.link
+        texels[levels : levels + count, 2:] = cut.places.spacing
         self._places.write(texels, viewport=(0, 0, PLACES_WIDTH, rows))
         self._places.use(PLACES_UNIT)
-        self._program["places"].value = PLACES_UNIT
-        self._program["levels"].value = levels
 
-    def _submit(self, cut: Cut, part: slice, camera: Camera) -> None:
+    def _submit(self, samples: _Samples, cut: Cut, part: slice, camera: Camera) -> None:
         """Draw nodes that are in the arena."""
         nodes = cut.nodes[part]
         slots = self._arena.slots_of(nodes)
@@ -253,9 +267,9 @@ class GlBackend:
             commands["base_instance"] = np.arange(len(nodes))
             self._placements.write(placement)
             self._commands.write(commands)
-            self._points.render_indirect(self._commands, moderngl.POINTS, len(nodes))
+            samples.points.render_indirect(self._commands, moderngl.POINTS, len(nodes))
             return
-        write, render, size = self._program["cloud"].write, self._points.render, PLACEMENT.itemsize
+        write, render, size = samples.program["cloud"].write, samples.points.render, PLACEMENT.itemsize
         told = placement.tobytes()
         for row, (count, start) in enumerate(zip(counts.tolist(), first.tolist(), strict=True)):
             write(told[row * size : (row + 1) * size])
@@ -271,11 +285,29 @@ class GlBackend:
         self._closing.render(moderngl.TRIANGLES, vertices=3)
         return self._closed
 
-    def _eye_dome(self, layers: _Layers, camera: Camera, style: Style) -> Any:
+    def _blend(self, layers: _Layers, cut: Cut, take: Take, camera: Camera, style: Style) -> int:
+        """Show the mean of the samples in the picture of discs; see `blending`."""
+        blended = self._blended
+        blended.target.use()
+        blended.target.clear()
+        self._context.enable_only(moderngl.BLEND | moderngl.PROGRAM_POINT_SIZE)
+        self._context.blend_func = moderngl.ONE, moderngl.ONE
+        layers.images["depths"].use(0)
+        self._kernels.program["depths"].value = 0
+        uploads = self._draw_samples(self._kernels, blended.target, cut, take, camera, style)
+        blended.picture.use()
+        self._context.enable_only(moderngl.NOTHING)
+        for unit, (name, image) in enumerate((("picture", layers.images["picture"]), ("sums", blended.sums))):
+            image.use(unit)
+            self._mean[name].value = unit
+        self._averaging.render(moderngl.TRIANGLES, vertices=3)
+        return uploads
+
+    def _eye_dome(self, picture: Any, layers: _Layers, camera: Camera, style: Style) -> Any:
         self._dimmed.use()
         self._context.enable_only(moderngl.NOTHING)
-        for unit, name in enumerate(("picture", "depths")):
-            layers.images[name].use(unit)
+        for unit, (name, image) in enumerate((("picture", picture), ("depths", layers.images["depths"]))):
+            image.use(unit)
             self._dimmer[name].value = unit
         self._dimmer["strength"].value = style.edl_strength * camera.focal
         self._dimming.render(moderngl.TRIANGLES, vertices=3)
@@ -316,6 +348,29 @@ class _Layers:
         self.only_depth = context.framebuffer([self.images["depths"]])
 
 
+class _Sums:
+    """The sums of blended samples, and the picture that is made of them."""
+
+    def __init__(self, context: Any, size: tuple[int, int]) -> None:
+        self.sums, self.image = context.texture(size, 4, dtype="f4"), context.texture(size, 4)
+        self.target, self.picture = (context.framebuffer([texture]) for texture in (self.sums, self.image))
+
+
+class _Samples:
+    """A pass over the samples of a cut."""
+
+    def __init__(self, context: Any, fragment: str, defines: str, content: list[Any]) -> None:
+        shaders = _shader("splat.vert.glsl", defines), _shader(fragment, defines)
+        self.program = context.program(vertex_shader=shaders[0], fragment_shader=shaders[1])
+        self.points = context.vertex_array(self.program, content)
+
+    def tell(self, values: dict[str, Any]) -> None:
+        """Set the uniforms that this pass has."""
+        for name, value in values.items():
+            if name in self.program:
+                self.program[name].value = value
+
+
 def _context() -> Any:
     """Make an off-screen context: through EGL where there is one, else as moderngl does on this system."""
     problems = []
@@ -332,7 +387,7 @@ def _shader(name: str, defines: str = "") -> str:
     """Text of a shader: GLSL with the constants of `splats` and `shading` for @NAME@."""
     text = (files(__package__) / "shaders" / name).read_text(encoding="utf-8")
     kinds = "".join(f"#define {kind} {number}\n" for number, kind in enumerate(("POINT", "SQUARE", "BALL", "DISC")))
-    constants = {**vars(splats), **vars(shading), "EMPTY": EMPTY}
+    constants = {**vars(splats), **vars(shading), "EMPTY": EMPTY, "LEAST": LEAST}
 
     def constant(match: re.Match[str]) -> str:
         value = constants[match[1]]

@@ -1,7 +1,8 @@
 """Clouds as the renderers hold them: 12 bytes a sample, still quantised.
 
     u16 x, y, z     position inside the cloud, in steps of `scale` from `origin`
-    u16 normal      two octahedral bytes, the first in the low byte; 0: no normal
+    u16 normal      two octahedral bytes, the first in the low byte; 0: none. Of a model without normals that of the
+                    sample's plane (`planes`), of either sign
     u8  r, g, b, -  colour; white where the model has none
 
 The same bytes feed the CPU kernels and OpenGL's vertex fetch.
@@ -13,6 +14,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from .planes import planes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -69,9 +72,11 @@ class Packer:
         vertex[:, :3] = cloud.position[:count]
         if self._normal is not None and self._normal.name in cloud.codes:
             vertex[:, 3] = _normal_bytes(cloud.codes[self._normal.name][:count], self._normal.bits)
+        elif self._normal is None:
+            vertex[:, 3] = planes(vertex[:, :3])
         color = np.full((count, 4), 255, dtype=np.uint8)
         if self._color is not None and self._color.name in cloud.codes:
-            color[:, :3] = cloud.codes[self._color.name][:count] >> max(self._color.bits - 8, 0)
+            color[:, :3] = _color_bytes(cloud.codes[self._color.name][:count], self._color)
         cell = 2.0**cloud.shift
         dropped = (cell - 1) / 2  # the low bits that are not drawn, on average
         origin = self._origin + self._step * (cloud.origin.astype(np.float64) + dropped)
@@ -80,6 +85,11 @@ class Packer:
 
 def _find(header: Header, kind: str) -> Attribute | None:
     return next((attribute for attribute in header.attributes if attribute.kind == kind), None)
+
+
+def _color_bytes(codes: NDArray[Any], attribute: Attribute) -> NDArray[Any]:
+    """Colour codes of any width as a byte a channel."""
+    return attribute.full(codes) >> max((attribute.depth or attribute.bits) - 8, 0)
 
 
 def _normal_bytes(codes: NDArray[Any], bits: int) -> NDArray[np.uint16]:

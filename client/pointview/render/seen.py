@@ -19,7 +19,7 @@ def place_table(cut: Cut) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return a cut's places as the kernels read them: of the nodes, and the halvings of the levels."""
     if cut.places is None:
         return np.empty(0, dtype=kernels.PLACE), np.empty(0, dtype=kernels.HALVING)
-    places = np.empty(len(cut.nodes), dtype=kernels.PLACE)
+    places = np.empty(len(cut.places.link), dtype=kernels.PLACE)
     places["lower"], places["upper"] = cut.places.link.T
     places["lower_spacing"], places["upper_spacing"] = cut.places.spacing.T
     halvings = np.empty(len(cut.places.axis), dtype=kernels.HALVING)
@@ -27,19 +27,22 @@ def place_table(cut: Cut) -> tuple[NDArray[Any], NDArray[Any]]:
     return places, halvings
 
 
-def pixels_by_cell(depth: NDArray[np.float32], cut: Cut, camera: Camera) -> NDArray[np.int64]:
+def pixels_by_cell(depth: NDArray[np.float32], cut: Cut, camera: Camera, *, stride: int = 1) -> NDArray[np.int64]:
     """Count the pixels that show a surface in each half of the cell of each node of a cut, (n, 2).
 
     Parameters
     ----------
     depth : (h, w) float32
         `Frame.depth` of that cut.
+    stride : int
+        Count every so many pixels of every so many lines.
     """
     places, halvings = place_table(cut)
-    counts = np.zeros((len(cut.nodes), 2), dtype=np.int64)
+    counts = np.zeros((max(len(places), len(cut.nodes)), 2), dtype=np.int64)
     if cut.places is not None and len(places):
         eye = (np.array(camera.eye) - cut.places.corner[0]).astype(np.float32)
+        looked = np.ascontiguousarray(depth[::stride, ::stride])
         picture_kernels.count_cells(
-            counts, depth, places, halvings, eye, camera.rotation().astype(np.float32), camera.focal
+            counts, looked, places, halvings, eye, camera.rotation().astype(np.float32), camera.focal / stride
         )
-    return counts
+    return counts[: len(cut.nodes)]

@@ -53,6 +53,13 @@ LONGEST = 3600.0
     type=click.Choice(["auto", "off"]),
     help="auto leaves out what is hidden, where that pays, at the price of a few pixels.",
 )
+@click.option(
+    "--prefetch",
+    default="auto",
+    show_default=True,
+    type=click.Choice(["auto", "off"]),
+    help="auto fetches what a moving camera will see next where the link would be idle.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print report.json on stdout.")
 def stream(
     model: str,
@@ -67,6 +74,7 @@ def stream(
     priority: str,
     splat_rule: str,
     occlusion: str,
+    prefetch: str,
     as_json: bool,
 ) -> None:
     """Stream MODEL over a link and report its error against run time."""
@@ -95,6 +103,7 @@ def stream(
         priority="index" if priority == "index" else "error",
         splat_rule="paper" if splat_rule == "paper" else "place",
         occlusion="off" if occlusion == "off" else "auto",
+        prefetch="off" if prefetch == "off" else "auto",
         views=views,
     )
     prepare_folder(report)
@@ -112,6 +121,8 @@ def stream(
     click.echo(f"settled         {settled}")
     click.echo(f"received        {result.bytes:,} bytes in {result.requests} requests")
     click.echo(f"link used       {use}")
+    if result.speculative_bytes:
+        click.echo(f"fetched ahead   {result.speculative_bytes:,} bytes, {result.wasted_bytes:,} of them never drawn")
     if result.occlusion == "auto":
         click.echo(f"hidden          {result.occlusion_note or f'{result.occluded:,} branches left out'}")
     click.echo(f"report          {written[0]}")

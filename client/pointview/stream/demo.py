@@ -69,9 +69,16 @@ def tour(folder: Path, *, scan: Path | None, seconds: float, link: str) -> Itera
         yield from _announce("stream", *arguments)
         result = _run("stream", *arguments)
     yield ""
-    yield f"Pictures at 1, 10, 20 and 30 s, and curve.png: {report}"
+    yield f"Pictures at {_picture_times(report)} s, and curve.png: {report}"
     yield ""
     yield from _five_figures(result)
+
+
+def _picture_times(report: Path) -> str:
+    """Name the times of the pictures that are there, "1, 10 and 12.5"."""
+    times = sorted(float(path.name[6:-5]) for path in report.glob("frame-*[0-9]s.png"))
+    *most, last = [f"{time:g}" for time in times]
+    return f"{', '.join(most)} and {last}" if most else last
 
 
 def _five_figures(result: dict[str, Any]) -> Iterator[str]:

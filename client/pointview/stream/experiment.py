@@ -61,6 +61,7 @@ class Experiment:
     priority : {"index", "error"}
     splat_rule : {"place", "paper"}
     occlusion : {"auto", "off"}
+    prefetch : {"auto", "off"}
     views : ViewPath, optional
         Where the camera is; the whole model without.
     """
@@ -75,6 +76,7 @@ class Experiment:
     priority: Priority
     splat_rule: SplatRule = "place"
     occlusion: Literal["auto", "off"] = "off"
+    prefetch: Literal["auto", "off"] = "auto"
     views: ViewPath | None = None
 
     def camera_at(self, header: Header, t: float) -> Camera:
@@ -93,6 +95,7 @@ class Experiment:
             priority=self.priority,
             splat_rule=self.splat_rule,
             occlusion=self.occlusion == "auto",
+            prefetch=self.prefetch == "auto",
             threads=min(os.cpu_count() or 1, MOST_THREADS),
         )
 
@@ -189,6 +192,7 @@ def _report(
     assert recording.header is not None
     stats, rate = recording.stats, experiment.profile.down_rate
     could_carry = None if rate is None else rate / 8.0 * stats.wanted_seconds
+    carried = max(0, stats.payload_bytes - stats.idle_bytes)  # what came while nothing was wanted is not to its credit
     return Report(
         model=experiment.model,
         link=experiment.link,
@@ -196,6 +200,7 @@ def _report(
         priority=experiment.priority,
         splat_rule=experiment.splat_rule,
         occlusion=experiment.occlusion,
+        prefetch=experiment.prefetch,
         occluded=recording.occluded,
         occlusion_note=recording.occlusion_note,
         size=experiment.size,
@@ -203,13 +208,16 @@ def _report(
         samples=recording.samples,
         bytes=stats.bytes_received,
         requests=stats.requests,
-        link_utilisation=None if not could_carry else min(1.0, stats.payload_bytes / could_carry),
+        link_utilisation=None if not could_carry else min(1.0, carried / could_carry),
         first_picture_s=recording.first_picture_s,
         settled_s=recording.settled_s,
         tolerance=experiment.tolerance,
         model_samples=recording.header.samples,
         model_bytes=recording.header.bytes,
         payload_bytes=stats.payload_bytes,
+        speculative_bytes=stats.speculative_bytes,
+        idle_bytes=stats.idle_bytes,
+        wasted_bytes=stats.wasted_bytes,
         wanted_s=stats.wanted_seconds,
         frames=recording.frames,
         errors=(

@@ -35,6 +35,7 @@ class Report:
     priority: str
     splat_rule: str
     occlusion: str
+    prefetch: str
     occluded: int
     occlusion_note: str | None
     size: tuple[int, int]
@@ -49,6 +50,9 @@ class Report:
     model_samples: int
     model_bytes: int
     payload_bytes: int
+    speculative_bytes: int
+    idle_bytes: int
+    wasted_bytes: int
     wanted_s: float
     frames: int
     errors: tuple[str, ...]

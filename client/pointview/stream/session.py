@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import zstandard
 
+from pointview.lookahead import Lookahead
 from pointview.occlusion import KEPT, Occlusion
 from pointview.refine import Cut, Priority, SplatRule, refine
 from pointview.render import Kind, Style, open_backend
@@ -52,6 +53,8 @@ class SessionOptions:
         What the size of a splat follows.
     occlusion : bool
         Leave out what is hidden, where that pays.
+    prefetch : bool
+        Fetch what a moving camera's next views will want where the link would idle.
     frame_interval : float
         Seconds between two frames.
     backend : {"auto", "gl", "cpu"}
@@ -65,6 +68,7 @@ class SessionOptions:
     priority: Priority = "index"
     splat_rule: SplatRule = "place"
     occlusion: bool = True
+    prefetch: bool = True
     frame_interval: float = 1.0 / 30.0
     backend: Kind = "auto"
     threads: int = 1
@@ -232,6 +236,7 @@ class _Session:
         self.layer, self.camera_at, self.options = layer, camera_at, options
         self.clock, self.start, self.drawer, self.tell = clock, start, drawer, tell
         self.recording = Recording()
+        self.lookahead = Lookahead()
         self.occlusion: Occlusion | None = None
         self.tested: tuple[object, ...] = ()
         self.steady = 0
@@ -276,6 +281,9 @@ class _Session:
         camera = self.camera_at(layer.header, t)
         cut = self._refine(camera)
         layer.end_frame(cut.asks, pinned=cut.nodes)
+        if self.options.prefetch:
+            self.lookahead.note(t, camera)
+            layer.prefetch(self.lookahead.nodes(self._refine) if layer.spare else [])
         recording.frames += 1
         if len(cut.nodes):
             if recording.first_picture_s is None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import click
 
+from lpc.errors import NotFound
 from pointstream.arguments import COUNT, POSITIVE
 from pointstream.cli import CACHE, choose_cache
 from pointview.cli import MOST_THREADS, TOLERANCE, SizeType, ViewType, read_link
@@ -63,11 +64,13 @@ def view(
     options = ViewerOptions(backend=backend, threads=min(os.cpu_count() or 1, MOST_THREADS), folder=folder, view=view)
 
     def open_feed(target: str) -> Feed:
-        return Feed(target, cache=choose_cache(cache, target), link=profile)
+        return Feed(target, cache=choose_cache(cache, target), link=profile, wake=Screen.wake)
 
+    if model is not None and "://" not in model and not Path(model).exists():
+        raise NotFound(f"{model}: there is no such file")  # before a window is opened for it
     title = "pointstream" if model is None else f"{model} - pointstream"
     with Screen(title, size) as screen:
-        viewer = Viewer(open_feed, options, settings)
+        viewer = Viewer(open_feed, options, settings, wake=Screen.wake)
         try:
             if model is not None:
                 viewer.open(model)

@@ -180,9 +180,9 @@ def anchor_of(view: Viewpoint, x: float, y: float, picked: Vector | None) -> Vec
     return unproject(view.camera, x, y, depth)
 
 
-def vertical_of(*, georeferenced: bool) -> Vector:
-    """Return the model's up, as `Camera.frame_model` takes it."""
-    return (0.0, 0.0, 1.0) if georeferenced else (0.0, 1.0, 0.0)
+def vertical_of(*, z_up: bool) -> Vector:
+    """Return the model's up: z or y."""
+    return (0.0, 0.0, 1.0) if z_up else (0.0, 1.0, 0.0)
 
 
 def _framed(view: Viewpoint, bounds: ArrayLike, backward: Vector, up: Vector) -> Viewpoint:

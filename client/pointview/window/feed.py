@@ -1,7 +1,8 @@
 """The access layer in a thread of its own: frames never wait for the network, nor the network for frames.
 
     frame loop                         feed's thread
-    ask(wants, pinned)  ─ a slot ────▶ end_frame(latest wants), every `TICK`
+    ask(wants, pinned)  ─ a slot ────▶ end_frame(latest wants), every `TICK`; what a moving camera will want next is
+                                       found here too, where the link has time for it
     news()              ◀─ a deque ─── what came, what was dropped
     stats               ◀─ a slot ──── counters
 
@@ -27,6 +28,8 @@ from lpc.errors import LpcError
 from pointlink.front import precise_loop
 from pointstream.layer import AccessLayer, LayerOptions
 from pointstream.stores import open_store
+from pointview.lookahead import Lookahead
+from pointview.refine import Cut, refine
 from pointview.stream.network import open_link
 
 from .mirror import Came, Failed, Gone, News, Opened
@@ -39,6 +42,7 @@ if TYPE_CHECKING:
     from pointlink.profiles import Profile
     from pointstream.cache import Cache
     from pointstream.stats import LayerStats
+    from pointview.camera import Camera
 
 TICK = 1 / 60
 """Seconds between two looks at the wants."""
@@ -46,17 +50,35 @@ TICK = 1 / 60
 MOST_NEWS = 512
 """News that one frame takes in: a fast disk must not turn a frame into an upload of everything."""
 
+LOOK_EVERY = 0.1
+"""Seconds from one look ahead of a moving camera to the next: it takes time from the frame loop."""
+
+REST = 0.25
+"""Seconds without another camera after which it does not move."""
+
 PATIENCE = 5.0
 """Seconds that closing waits for the thread."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class View:
+    """How a frame was refined, for views that follow it; parameters as of `pointview.refine.refine`."""
+
+    camera: Camera
+    tolerance: float
+    cull_backfaces: bool
+    hidden: NDArray[np.bool_] | None
+
+
 @dataclass(frozen=True, slots=True)
 class Ask:
-    """What the latest frame wants and draws."""
+    """What the latest frame wants and draws, its view, and when that was, seconds."""
 
     build: int
     wants: NDArray[np.int64]
     pinned: NDArray[np.int64]
+    view: View | None
+    at: float
 
 
 class Feed:
@@ -71,6 +93,8 @@ class Feed:
         Put this link before the model.
     capacity : int
         Bytes of decoded clouds.
+    wake : callable
+        Told of every piece of news, on the feed's thread: a frame loop may sleep until then.
 
     Attributes
     ----------
@@ -87,15 +111,19 @@ class Feed:
         cache: Cache | None = None,
         link: Profile | None = None,
         capacity: int = LayerOptions().capacity,
+        wake: Callable[[], None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.target, self._cache, self._link = target, cache, link
-        self._options, self._clock = LayerOptions(capacity=capacity), clock
+        self._options, self._wake, self._clock = LayerOptions(capacity=capacity), wake, clock
         self._news: deque[News] = deque()
         self._ask: Ask | None = None
         self._stats: LayerStats | None = None
         self._wanting = True
         self._closing = False
+        self._lookahead = Lookahead()
+        self._camera: Camera | None = None
+        self._moved_at = self._look_at = 0.0
         self.longest_handover = 0.0
         self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
         self._thread.start()
@@ -103,10 +131,10 @@ class Feed:
 
     # What the frame loop calls.
 
-    def ask(self, build: int, wants: NDArray[np.int64], pinned: NDArray[np.int64]) -> None:
-        """Replace what is wanted."""
+    def ask(self, build: int, wants: NDArray[np.int64], pinned: NDArray[np.int64], view: View | None = None) -> None:
+        """Replace what is wanted; where the frame's view is told, those that follow it are fetched ahead."""
         start = self._clock()
-        self._ask = Ask(build, wants, pinned)
+        self._ask = Ask(build, wants, pinned, view, start)
         self._handed_over(start)
 
     def news(self) -> list[News]:
@@ -146,6 +174,7 @@ class Feed:
             except (LpcError, OSError) as error:
                 self._news.append(Failed(" ".join(str(error).split())))
                 self._wanting = False
+                self._wake()
 
     async def _until_closed(self) -> None:
         """Feed until `close`, which may come while a host does not answer."""
@@ -169,12 +198,39 @@ class Feed:
                 if stats.build != build:
                     build, posted = stats.build, np.zeros(layer.header.nodes, dtype=bool)
                     self._news.append(Opened(layer.index, build))
+                    self._wake()
                 ask = self._ask
                 if ask is not None and ask.build == build:
                     layer.end_frame(ask.wants, pinned=ask.pinned)
+                    self._look_ahead(layer, ask)
                 posted = self._post(layer, posted)
                 self._stats, self._wanting = stats, layer.wanting
                 await asyncio.sleep(TICK)
+
+    def _look_ahead(self, layer: AccessLayer, ask: Ask) -> None:
+        """Fetch what a moving camera will want next, where the link has time for it."""
+        now, view = self._clock(), ask.view
+        if view is None:
+            return
+        if view.camera != self._camera:  # what came in meanwhile is asked for with the same one
+            self._lookahead.note(ask.at, view.camera)
+            self._camera, self._moved_at = view.camera, ask.at
+        if now < self._look_at:
+            return
+        self._look_at = now + LOOK_EVERY
+
+        def look(camera: Camera) -> Cut:
+            return refine(
+                layer.index,
+                camera,
+                view.tolerance,
+                layer.resident,
+                cull_backfaces=view.cull_backfaces,
+                hidden=view.hidden,
+            )
+
+        moves = now - self._moved_at < REST
+        layer.prefetch(self._lookahead.nodes(look) if moves and layer.spare else [])
 
     @contextlib.asynccontextmanager
     async def _layer(self) -> AsyncIterator[AccessLayer]:
@@ -198,4 +254,5 @@ class Feed:
             self._news.append(Gone(tuple(gone.tolist())))
         for node in changed[resident[changed]].tolist():
             self._news.append(Came(node, layer.take(node)))
+        self._wake()
         return resident

@@ -26,6 +26,7 @@ KEYS: tuple[tuple[str, str], ...] = (
     ("F", "fit the model"),
     ("Home", "first view"),
     ("1 ... 6", "front, back, left, right, top, bottom"),
+    ("U", "y or z is up"),
     ("C", "next colour mode"),
     ("T", "tint what waits for data"),
     ("[ ]", "finer, coarser"),

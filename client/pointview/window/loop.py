@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from .overlay import Overlay
 from .panel import Panel
 
 if TYPE_CHECKING:
@@ -13,9 +14,6 @@ if TYPE_CHECKING:
 
     from .screen import Screen
     from .viewer import Viewer
-
-SMOOTH = 0.1
-"""Weight of a new frame in the frame rate that is shown."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,21 +68,24 @@ def run_loop(
     panel = Panel()
     frames = pictures = 0
     longest, first_picture = 0.0, None
-    start = before = clock()
+    start = clock()
     while not (screen.closing or viewer.closing):
         screen.wait(busy=viewer.busy)
         began = clock()
-        did = screen.begin()
+        inset = panel.inset(viewer.settings, screen.letters)
+        did = screen.begin(inset)
         picture = viewer.advance(replace(did, pressed=did.pressed | panel.commands))
         if picture is not None:
             screen.show(picture)
             pictures += 1
+        elif viewer.frame is None:
+            screen.blank()
+        screen.rename(viewer.title)
         panel.draw(viewer, screen.renderer)
+        Overlay.beside(inset).show(viewer)
         screen.end()
         ended = clock()
         frames += 1
-        panel.frames_per_second += SMOOTH * (1.0 / max(ended - before, 1e-4) - panel.frames_per_second)
-        before = ended
         if first_picture is not None:
             longest = max(longest, ended - began)
         elif viewer.frame is not None and viewer.frame.clouds:

@@ -1,26 +1,38 @@
-"""What is written on the picture: settings, legend, statistics, load bar, help. Edits `Settings` and nothing else."""
+"""The panel beside the picture: settings and statistics. Edits `Settings` and nothing else."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 from imgui_bundle import imgui
 
-from pointview.colouring import Legend, Mode, available_modes
+from pointview.colouring import Mode, available_modes
+from pointview.render import Splat
 
 from .inputs import AXES, KEYS
+from .overlay import written_bytes
 from .settings import BUDGETS, TOLERANCES, Settings
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from .viewer import Viewer
 
-WIDTH = 24.0
+WIDTH = 22.0
 """Of the panel, in heights of its letters."""
 
+BESIDE = 2.2
+"""Widths of the panel that a window must have for the picture to stand beside it; else the panel stands on it."""
+
 MODE_NAMES: dict[Mode, str] = {
-    "color": "colour", "shading": "shading alone", "height": "height", "intensity": "intensity",
-    "classification": "classification", "normal": "normal", "level": "level",
+    "color": "the model's own", "shading": "shading alone", "height": "height", "intensity": "intensity",
+    "classification": "classification", "normal": "normals", "level": "level of the tree",
+}  # fmt: skip
+
+SPLATS: tuple[Splat, ...] = get_args(Splat)
+SPLAT_NAMES: dict[str, str] = {
+    "disc": "discs in the surface", "round": "discs", "square": "squares", "blended": "blended surface",
 }  # fmt: skip
 
 
@@ -34,8 +46,12 @@ class Panel:
         Keys that its buttons stand for, as of the last frame.
     """
 
-    frames_per_second: float = 0.0
     commands: frozenset[str] = frozenset()
+
+    @staticmethod
+    def inset(settings: Settings, window: float) -> float:
+        """Return what the panel takes of a window on its left, in heights of its letters."""
+        return WIDTH if settings.panel and window >= BESIDE * WIDTH else 0.0
 
     def draw(self, viewer: Viewer, renderer: str) -> None:
         """Write one frame of it."""
@@ -44,136 +60,149 @@ class Panel:
         if settings.panel:
             self._settings(viewer, renderer)
         if settings.help:
-            _help(settings)
-        _load_bar(viewer)
+            _help(settings, self.inset(settings, imgui.get_io().display_size.x / imgui.get_font_size()))
 
     def _settings(self, viewer: Viewer, renderer: str) -> None:
-        settings, letter = viewer.settings, imgui.get_font_size()
-        imgui.set_next_window_pos((letter / 2, letter / 2), imgui.Cond_.first_use_ever)
-        imgui.set_next_window_size((WIDTH * letter, 0), imgui.Cond_.always)
-        imgui.begin("pointstream", None, imgui.WindowFlags_.no_resize | imgui.WindowFlags_.no_nav)
+        letter, flags = imgui.get_font_size(), imgui.WindowFlags_
+        imgui.set_next_window_pos((0, 0), imgui.Cond_.always)
+        imgui.set_next_window_size((WIDTH * letter, imgui.get_io().display_size.y), imgui.Cond_.always)
+        imgui.begin("pointstream", None, flags.no_decoration & ~flags.no_scrollbar | flags.no_nav | flags.no_move)
         imgui.push_item_width(-6.5 * letter)
-        self._views(settings)
-        if imgui.collapsing_header("Quality", imgui.TreeNodeFlags_.default_open):
-            _quality(settings)
-        if imgui.collapsing_header("Colours", imgui.TreeNodeFlags_.default_open):
+        opened = imgui.TreeNodeFlags_.default_open
+        if imgui.collapsing_header("View", opened):
+            self._views(viewer)
+        if imgui.collapsing_header("Colours", opened):
             _colours(viewer)
-        if imgui.collapsing_header("Statistics", imgui.TreeNodeFlags_.default_open):
-            self._statistics(viewer, renderer)
-        imgui.separator()
-        for label, key in (("picture", "p"), ("stop" if viewer.recorder else "record", "r"), ("help", "f1")):
-            self._button(label, key)
-            imgui.same_line()
-        imgui.new_line()
-        if viewer.message:
-            imgui.text_wrapped(viewer.message)
+        if imgui.collapsing_header("Quality", opened):
+            _quality(viewer)
+        if imgui.collapsing_header("Statistics", opened):
+            _statistics(viewer, renderer)
         imgui.pop_item_width()
         imgui.end()
 
-    def _views(self, settings: Settings) -> None:
-        self._button("fit", "f")
-        imgui.same_line()
-        self._button("home", "home")
-        imgui.same_line()
-        _, settings.fly = imgui.checkbox("fly", settings.fly)
-        for key, name in AXES.items():
-            if key not in "14":
+    def _views(self, viewer: Viewer) -> None:
+        settings = viewer.settings
+        self._buttons((("fit", "f"), ("home", "home"), ("help", "f1")))
+        names = [(name, key) for key, name in AXES.items()]
+        self._buttons(names[:3])
+        self._buttons(names[3:])
+        recording = viewer.recorder is not None
+        self._buttons((("picture", "p"), ("stop" if recording else "record path", "r"), ("tint", "t")))
+        imgui.align_text_to_frame_padding()
+        imgui.text("up is")
+        for axis in ("y", "z"):
+            imgui.same_line()
+            if imgui.radio_button(axis, viewer.up == axis):
+                settings.up = "y" if axis == "y" else "z"
+        imgui.same_line(0, 2 * imgui.get_font_size())
+        _, settings.marks = imgui.checkbox("axes, scale", settings.marks)
+        _, settings.fly = imgui.checkbox("dragging turns the head (G)", settings.fly)
+        flags = imgui.SliderFlags_.logarithmic
+        _, settings.speed = imgui.slider_float("fly speed", settings.speed, 0.01, 2.0, "%.2f sizes/s", flags)
+
+    def _buttons(self, those: Iterable[tuple[str, str]]) -> None:
+        """Write three buttons in a row, which stand for keys."""
+        width = (imgui.get_content_region_avail().x - 2 * imgui.get_style().item_spacing.x) / 3
+        for number, (label, key) in enumerate(those):
+            if number:
                 imgui.same_line()
-            self._button(name, key)
-        if settings.fly:
-            _, settings.speed = imgui.slider_float(
-                "speed", settings.speed, 0.01, 2.0, "%.2f", imgui.SliderFlags_.logarithmic
-            )
-
-    def _button(self, label: str, key: str) -> None:
-        if imgui.small_button(label):
-            self.commands |= {key}
-
-    def _statistics(self, viewer: Viewer, renderer: str) -> None:
-        cut, frame = viewer.cut, viewer.frame
-        lines = [f"{self.frames_per_second:.0f} frames/s   {viewer.painter.name or 'no picture yet'}"]
-        if cut is not None and frame is not None:
-            lines.append(f"{frame.splats:,} splats   {frame.clouds:,} clouds")
-            lines.append(f"{int(cut.starved.sum()):,} starved   {len(cut.wants):,} wanted")
-            culled = cut.culled
-            lines.append(f"culled: {culled.frustum:,} outside, {culled.backface:,} away, {culled.occluded:,} hidden")
-            lines.append(f"{cut.max_spacing_px:.2f} px at the coarsest place")
-        stats = None if viewer.feed is None else viewer.feed.stats
-        if stats is not None:
-            rate = "no link" if stats.goodput is None else f"{_bytes(stats.goodput)}/s"
-            lines.append(f"{rate}   {_bytes(stats.bytes_received)} received")
-            lines.append(f"{stats.resident_clouds:,} clouds resident, {_bytes(stats.resident_bytes)}")
-            lines += [f"{error.text} ({error.count})" for error in stats.errors[:2]]
-        for line in lines:
-            imgui.text_wrapped(line)
-        if renderer:
-            imgui.text_disabled(renderer)
+            if imgui.button(label, (width, 0)):
+                self.commands |= {key}
+            imgui.set_item_tooltip(f"key {key.title()}")
 
 
-def _quality(settings: Settings) -> None:
-    logarithmic = imgui.SliderFlags_.logarithmic
+def _quality(viewer: Viewer) -> None:
+    settings, logarithmic = viewer.settings, imgui.SliderFlags_.logarithmic
     _, settings.tolerance = imgui.slider_float("tolerance", settings.tolerance, *TOLERANCES, "%.2f px", logarithmic)
-    _, settings.limited = imgui.checkbox("##limited", settings.limited)
-    imgui.same_line()
-    imgui.begin_disabled(not settings.limited)
-    imgui.set_next_item_width(imgui.calc_item_width() - imgui.get_frame_height_with_spacing())
-    _, settings.budget = imgui.slider_int("splats", settings.budget, *BUDGETS, "%d", logarithmic)
-    imgui.end_disabled()
-    _, settings.steady = imgui.checkbox("##steady", settings.steady)
-    imgui.same_line()
-    imgui.begin_disabled(not settings.steady)
-    imgui.set_next_item_width(imgui.calc_item_width() - imgui.get_frame_height_with_spacing())
-    changed, milliseconds = imgui.slider_float(
-        "ms a frame", 1e3 * settings.frame_seconds, 5.0, 500.0, "%.0f", logarithmic
+    low, high = (1e-6 * budget for budget in BUDGETS)
+    settings.steady, milliseconds = _limit(
+        "a frame", settings.steady, 1e3 * settings.frame_seconds, (5.0, 500.0), "%.0f ms at most"
     )
+    settings.frame_seconds = milliseconds / 1e3
+    settings.limited, millions = _limit(
+        "splats", settings.limited, 1e-6 * settings.budget, (low, high), "%.2f M at most"
+    )
+    if abs(millions * 1e6 - settings.budget) > 1:
+        settings.budget = round(millions * 1e6)
+    names = [SPLAT_NAMES.get(splat, splat) for splat in SPLATS]
+    changed, at = imgui.combo("kind", SPLATS.index(settings.splat), names)
     if changed:
-        settings.frame_seconds = milliseconds / 1e3
-    imgui.end_disabled()
-    _, settings.oriented = imgui.checkbox("discs in the surface", settings.oriented)
+        settings.splat = SPLATS[at]
     _, settings.close_holes = imgui.checkbox("close holes", settings.close_holes)
+    imgui.same_line(0, 2 * imgui.get_font_size())
     _, settings.two_sided = imgui.checkbox("both sides", settings.two_sided)
+    _, settings.occlusion = imgui.checkbox("leave out what is hidden", settings.occlusion)
+    if viewer.culling.verdict is not None:
+        imgui.push_style_color(imgui.Col_.text, imgui.get_style_color_vec4(imgui.Col_.text_disabled))
+        imgui.text_wrapped(viewer.culling.verdict)
+        imgui.pop_style_color()
+
+
+def _limit(label: str, on: bool, value: float, ends: tuple[float, float], form: str) -> tuple[bool, float]:
+    """Write a limit that can be switched off."""
+    _, on = imgui.checkbox(f"##{label} on", on)
+    imgui.same_line()
+    imgui.begin_disabled(not on)
+    imgui.set_next_item_width(imgui.calc_item_width() - imgui.get_frame_height_with_spacing())
+    _, value = imgui.slider_float(label, value, *ends, form, imgui.SliderFlags_.logarithmic)
+    imgui.end_disabled()
+    return on, value
 
 
 def _colours(viewer: Viewer) -> None:
     settings, index = viewer.settings, viewer.mirror.index
     modes = ("shading",) if index is None else available_modes(index.header)
     at = modes.index(settings.mode) if settings.mode in modes else 0
-    changed, at = imgui.combo("mode", at, [MODE_NAMES[mode] for mode in modes])
+    changed, at = imgui.combo("colours", at, [MODE_NAMES[mode] for mode in modes])
     if changed:
         settings.mode = modes[at]
     _, settings.tint = imgui.checkbox("tint what waits for data", settings.tint)
-    colouring = viewer.painter.colouring
-    if colouring is not None and colouring.legend is not None:
-        _legend(colouring.legend)
 
 
-def _legend(legend: Legend) -> None:
-    draw, letter = imgui.get_window_draw_list(), imgui.get_font_size()
-    if legend.ramp is not None:
-        corner, width = imgui.get_cursor_screen_pos(), imgui.get_content_region_avail().x
-        steps = 64
-        for step in range(steps):
-            color = legend.ramp[step * 255 // (steps - 1)]
-            left, right = corner.x + width * step / steps, corner.x + width * (step + 1) / steps
-            draw.add_rect_filled((left, corner.y), (right, corner.y + letter * 0.8), _packed(*map(int, color)))
-        imgui.dummy((width, letter * 0.8))
-        imgui.text(f"{legend.low:g}")
-        high = f"{legend.high:g}"
-        imgui.same_line(imgui.get_cursor_pos_x() + width - imgui.calc_text_size(high).x)
-        imgui.text(high)
-    for text, color in legend.entries:
-        corner = imgui.get_cursor_screen_pos()
-        draw.add_rect_filled((corner.x, corner.y), (corner.x + letter, corner.y + letter), _packed(*color))
-        imgui.dummy((letter, letter))
-        imgui.same_line()
-        imgui.text(text)
+def _statistics(viewer: Viewer, renderer: str) -> None:
+    rows: list[tuple[str, str]] = []
+    cut, frame, stats = viewer.cut, viewer.frame, None if viewer.feed is None else viewer.feed.stats
+    if cut is not None and frame is not None:
+        culled = cut.culled
+        rows += [
+            ("splats", f"{frame.splats:,}"),
+            ("clouds", f"{frame.clouds:,}, {int(cut.starved.sum()):,} lack data"),
+            ("left out", f"{culled.frustum:,} outside, {culled.backface:,} away, {culled.occluded:,} hidden"),
+            ("coarsest", f"{cut.max_spacing_px:.2f} px"),
+            ("drawn in", f"{1e3 * viewer.drawing:.0f} ms, {viewer.painter.name.partition(' ')[0]}"),
+        ]
+    if stats is not None:
+        rtt = "" if stats.rtt is None else f", {1e3 * stats.rtt:.0f} ms"
+        rows += [
+            ("line", "a file" if stats.goodput is None else f"{written_bytes(stats.goodput)}/s{rtt}"),
+            ("received", f"{written_bytes(stats.bytes_received)}, {stats.requests:,} requests"),
+            ("ahead", f"{written_bytes(stats.speculative_bytes)}, {written_bytes(stats.wasted_bytes)} not drawn"),
+            ("in memory", f"{stats.resident_clouds:,} clouds, {written_bytes(stats.resident_bytes)}"),
+        ]
+        rows += [("trouble", f"{error.text} ({error.count} times)") for error in stats.errors[:3]]
+    if viewer.view is not None:
+        rows.append(("turns around", ", ".join(f"{value:.7g}" for value in viewer.view.pivot)))
+    if imgui.begin_table("statistics", 2):
+        imgui.table_setup_column("", imgui.TableColumnFlags_.width_fixed, 6.5 * imgui.get_font_size())
+        for name, value in rows:
+            imgui.table_next_row()
+            imgui.table_next_column()
+            imgui.text_disabled(name)
+            imgui.table_next_column()
+            imgui.text_wrapped(value)
+        imgui.end_table()
+    if renderer:
+        imgui.text_disabled(f"window: {renderer.partition(' (')[0]}")
 
 
-def _help(settings: Settings) -> None:
+def _help(settings: Settings, inset: float) -> None:
     size = imgui.get_io().display_size
-    imgui.set_next_window_pos((size.x / 2, size.y / 2), imgui.Cond_.appearing, (0.5, 0.5))
-    _, stays = imgui.begin("Controls", True, imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_nav)
-    if imgui.begin_table("keys", 2):
+    middle = ((inset * imgui.get_font_size() + size.x) / 2, size.y / 2)
+    imgui.set_next_window_pos(middle, imgui.Cond_.always, (0.5, 0.5))
+    imgui.set_next_window_size_constraints((0, 0), (size.x, size.y))
+    flags = imgui.WindowFlags_
+    _, stays = imgui.begin("Controls", True, flags.always_auto_resize | flags.no_nav | flags.no_collapse)
+    if imgui.begin_table("keys", 2, imgui.TableFlags_.sizing_fixed_fit):
         for key, text in KEYS:
             imgui.table_next_row()
             imgui.table_next_column()
@@ -183,31 +212,3 @@ def _help(settings: Settings) -> None:
         imgui.end_table()
     imgui.end()
     settings.help = bool(stays)
-
-
-def _load_bar(viewer: Viewer) -> None:
-    """Draw a line along the lower edge of the picture: how much of the view is here."""
-    here, whole = viewer.loaded
-    if viewer.feed is None or (whole and here >= whole):
-        return
-    size, letter = imgui.get_io().display_size, imgui.get_font_size()
-    draw = imgui.get_foreground_draw_list()
-    share = here / whole if whole else 0.0
-    top = size.y - letter / 4
-    draw.add_rect_filled((0.0, top), (size.x, size.y), _packed(60, 64, 72))
-    draw.add_rect_filled((0.0, top), (size.x * share, size.y), _packed(255, 214, 10))
-    text = f"{_bytes(here)} of {_bytes(whole)}" if whole else (viewer.message or "opening ...")
-    width = imgui.calc_text_size(text).x
-    draw.add_text((size.x - width - letter / 2, top - letter * 1.3), _packed(230, 230, 230), text)
-
-
-def _packed(red: int, green: int, blue: int) -> int:
-    return red | green << 8 | blue << 16 | 255 << 24
-
-
-def _bytes(count: float) -> str:
-    for unit in ("B", "KiB", "MiB"):
-        if count < 1024:
-            return f"{count:.0f} {unit}" if unit == "B" else f"{count:.1f} {unit}"
-        count /= 1024
-    return f"{count:.2f} GiB"

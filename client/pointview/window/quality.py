@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,10 +13,14 @@ from pointview.feedback import Feedback
 from pointview.refine import Cut, refine
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from pointview.camera import Camera
 
     from .mirror import Mirror
     from .settings import Settings
+
+    Hidden = NDArray[np.bool_] | None
 
 STILL = 6.0
 """Frame times that a frame of a camera at rest may take: nobody steers it."""
@@ -23,27 +28,37 @@ STILL = 6.0
 
 @dataclass(slots=True)
 class Quality:
-    """The tolerance from frame to frame: one while the camera moves, one for when it rests."""
+    """The tolerance from frame to frame: one while the camera moves, one for when it rests.
+
+    Attributes
+    ----------
+    tolerance : float
+        Of the last cut, pixels.
+    """
 
     moving: Feedback
     resting: Feedback
+    tolerance: float = math.inf
 
     @classmethod
     def at(cls, tolerance: float) -> Quality:
         """Start at a tolerance in pixels."""
         return cls(moving=Feedback(tolerance=tolerance), resting=Feedback(tolerance=tolerance))
 
-    def cut(self, mirror: Mirror, camera: Camera, settings: Settings, *, moving: bool) -> Cut:
+    def cut(self, mirror: Mirror, camera: Camera, settings: Settings, hidden: Hidden, *, moving: bool) -> Cut:
         """Compute the cut of a frame."""
         assert mirror.index is not None
-        tolerance, one_sided = settings.tolerance, not settings.two_sided
+        tolerance = settings.tolerance
+        options: dict[str, Any] = {"cull_backfaces": not settings.two_sided, "hidden": hidden}
         if settings.steady:
             tolerance = max(tolerance, (self.moving if moving else self.resting).tolerance)
+        self.tolerance = tolerance
         if not settings.limited:
-            return refine(mirror.index, camera, tolerance, mirror.resident, cull_backfaces=one_sided)
+            return refine(mirror.index, camera, tolerance, mirror.resident, **options)
         index = mirror.index
-        within = allowance(index, camera, settings.budget, index.known, at_least=tolerance, cull_backfaces=one_sided)
-        return refine_within(index, camera, within, mirror.resident, cull_backfaces=one_sided)
+        within = allowance(index, camera, settings.budget, index.known, at_least=tolerance, **options)
+        self.tolerance = within.tolerance
+        return refine_within(index, camera, within, mirror.resident, **options)
 
     def took(self, seconds: float, settings: Settings, *, moving: bool) -> bool:
         """Take in what a frame took; True if a camera at rest should be drawn again, with another tolerance."""
@@ -60,11 +75,11 @@ class Quality:
         return self.resting.tolerance != before
 
 
-def loaded_bytes(mirror: Mirror, camera: Camera, settings: Settings) -> tuple[int, int]:
+def loaded_bytes(mirror: Mirror, camera: Camera, settings: Settings, hidden: Hidden) -> tuple[int, int]:
     """Bytes of the view's clouds that are here, and of all that it will have as far as the index tells."""
     if mirror.index is None:
         return 0, 0
-    one_sided = not settings.two_sided
-    goal = refine(mirror.index, camera, settings.tolerance, mirror.index.known, cull_backfaces=one_sided).nodes
+    options: dict[str, Any] = {"cull_backfaces": not settings.two_sided, "hidden": hidden}
+    goal = refine(mirror.index, camera, settings.tolerance, mirror.index.known, **options).nodes
     sizes = mirror.index.size[goal]
     return int(sizes[mirror.resident[goal]].sum()), int(np.sum(sizes))

@@ -25,14 +25,18 @@ class Recorder:
     ----------
     start : float
         Seconds; times of the path count from here.
+    seconds : float
+        Since then, at the last view.
     """
 
     start: float
+    seconds: float = 0.0
     entries: list[dict[str, Any]] = field(default_factory=list)
 
     def note(self, now: float, camera: Camera) -> None:
         """Add the view of a frame, unless the last entry is too young."""
         t = max(0.0, round(now - self.start, 3))
+        self.seconds = t
         if not self.entries or t - self.entries[-1]["t"] >= APART:
             self.entries.append({"t": t, **camera.to_view()})
 

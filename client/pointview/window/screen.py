@@ -10,25 +10,26 @@ from imgui_bundle import imgui
 from imgui_bundle.python_backends.glfw_backend import GlfwRenderer
 
 from lpc.errors import Unavailable
+from pointview.render import Style
 
 from .inputs import Inputs
+from .keyboard import Keyboard
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     import numpy as np
     from numpy.typing import NDArray
 
-IDLE = 1 / 60
-"""Seconds that a frame without anything to do waits for input."""
+IDLE = 0.5
+"""Seconds that a frame without anything to do waits for input or news: the statistics are never older."""
 
-KEY_NAMES = {
-    **{letter: letter for letter in "abcdefgpqrstwxyzv"},
-    **{digit: f"_{digit}" for digit in "123456"},
-    "home": "home", "tab": "tab", "f1": "f1", "f12": "f12", "?": "slash", "[": "left_bracket", "]": "right_bracket",
-    "escape": "escape",
-}  # fmt: skip
-"""Our names of keys, and Dear ImGui's."""
+LIVELY = 6
+"""Frames after an event in which the panel may still change: menus open, a window finds its size."""
+
+LETTERS = 14.0
+"""Height of the panel's letters, pixels of a display of usual density."""
+
+LONGEST_STEP = 0.1
+"""Seconds that a frame moves the camera on at most, after whatever wait."""
 
 VERTEX = """#version 330
 out vec2 at;
@@ -85,13 +86,22 @@ class Screen:
         self._blit = self._context.vertex_array(program, [])
         self._texture: Any = None
         imgui.create_context()
-        imgui.get_io().set_ini_filename("")  # leaves no file behind
-        imgui.get_style().window_rounding = 4.0
+        io, style = imgui.get_io(), imgui.get_style()
+        io.set_ini_filename("")  # leaves no file behind
+        io.fonts.add_font_default_vector()
+        style.font_size_base = LETTERS
+        style.frame_rounding = style.grab_rounding = 3.0
+        style.set_color_(imgui.Col_.slider_grab, (0.26, 0.59, 0.98, 0.5))  # the number behind it stays legible
+        self._scale = 1.0
         self._imgui = GlfwRenderer(self._window, attach_callbacks=True)
+        self._keyboard = Keyboard(self._window, self._imgui)
         self._dropped: list[str] = []
         drop: Any = self._drop  # typed as one path by the stubs; it is a list
         glfw.set_drop_callback(self._window, drop)
         self._shown_at = glfw.get_time()
+        self._lively = LIVELY
+        self._title = title
+        self._corner, self._size = (0, 0), size
 
     @property
     def closing(self) -> bool:
@@ -103,42 +113,68 @@ class Screen:
         """What OpenGL calls the graphics hardware of the window."""
         return str(self._context.info["GL_RENDERER"])
 
+    @property
+    def letters(self) -> float:
+        """Width of the window in heights of the panel's letters."""
+        return float(glfw.get_window_size(self._window)[0] / (LETTERS * self._scale))
+
     def rename(self, title: str) -> None:
-        """Give the window another title."""
-        glfw.set_window_title(self._window, title)
+        """Give the window a title."""
+        if title != self._title:
+            glfw.set_window_title(self._window, title)
+            self._title = title
 
     def wait(self, *, busy: bool) -> None:
-        """Collect input; without anything to do, wait a moment for it."""
-        if busy:
+        """Collect input; without anything to do, wait for it or for `wake`."""
+        self._lively -= 1
+        if busy or self._lively > 0:
             glfw.poll_events()
-        else:
-            glfw.wait_events_timeout(IDLE)
+            return
+        start = glfw.get_time()
+        glfw.wait_events_timeout(IDLE)
+        if glfw.get_time() - start < IDLE:
+            self._lively = LIVELY
 
-    def begin(self) -> Inputs:
-        """Begin a frame of the panel and return what was done to the picture."""
+    @staticmethod
+    def wake() -> None:
+        """End a wait; from any thread."""
+        glfw.post_empty_event()
+
+    def begin(self, inset: float = 0.0) -> Inputs:
+        """Begin a frame of the panel and return what was done to the picture.
+
+        Parameters
+        ----------
+        inset : float
+            What the panel takes of the window on its left, in heights of its letters.
+        """
+        self._adapt()
         inputs: Any = self._imgui  # its methods carry no types
         inputs.process_inputs()
         imgui.new_frame()
         now = glfw.get_time()
-        seconds, self._shown_at = now - self._shown_at, now
+        seconds, self._shown_at = min(now - self._shown_at, LONGEST_STEP), now
         io, dropped = imgui.get_io(), tuple(self._dropped)
         self._dropped.clear()
         width, height = glfw.get_framebuffer_size(self._window)
         ratio = width / max(1.0, io.display_size.x)
-        mouse, keyboard = not io.want_capture_mouse, not io.want_text_input
+        if width and height:  # else it is minimised: the picture stays what it is
+            left = round(inset * imgui.get_font_size() * ratio)
+            self._corner, self._size = (left, 0), (max(1, width - left), height)
+        mouse = not io.want_capture_mouse
 
         def dragged(*buttons: int) -> tuple[float, float]:
             if not mouse or not any(imgui.is_mouse_down(button) for button in buttons):
                 return 0.0, 0.0
             return io.mouse_delta.x * ratio, io.mouse_delta.y * ratio
 
-        pressed, held = _keys() if keyboard else (frozenset[str](), frozenset[str]())
+        pressed, held = self._keyboard.take(heard=not io.want_text_input)
         if "paste" in pressed:
             dropped = (*dropped, *self._clipboard())
         return Inputs(
             seconds=seconds,
-            size=(max(1, width), max(1, height)),
-            cursor=(io.mouse_pos.x * ratio, io.mouse_pos.y * ratio),
+            size=self._size,
+            cursor=(io.mouse_pos.x * ratio - self._corner[0], io.mouse_pos.y * ratio),
             turned=dragged(0) if not io.key_shift else (0.0, 0.0),
             shifted=dragged(1, 2) if not io.key_shift else dragged(0, 1, 2),
             wheel=float(io.mouse_wheel) if mouse else 0.0,
@@ -152,19 +188,25 @@ class Screen:
         """Replace the picture."""
         size = (rgb.shape[1], rgb.shape[0])
         if self._texture is None or self._texture.size != size:
-            if self._texture is not None:
-                self._texture.release()
+            self.blank()
             self._texture = self._context.texture(size, 3, alignment=1)
         self._texture.write(rgb)
+
+    def blank(self) -> None:
+        """Take the picture away."""
+        if self._texture is not None:
+            self._texture.release()
+            self._texture = None
 
     def end(self) -> None:
         """Put picture and panel on the screen."""
         imgui.render()
         target = self._context.screen
         target.use()
-        self._context.viewport = (0, 0, *glfw.get_framebuffer_size(self._window))
+        self._context.viewport = (*self._corner, *self._size)
         self._context.disable(moderngl.BLEND | moderngl.DEPTH_TEST | moderngl.CULL_FACE)
-        target.clear()
+        red, green, blue = (channel / 255 for channel in Style().background)
+        target.clear(red, green, blue)
         if self._texture is not None:
             self._texture.use(0)
             self._blit.render(moderngl.TRIANGLES, vertices=3)
@@ -185,6 +227,16 @@ class Screen:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def _adapt(self) -> None:
+        """Give letters and margins the size of the display's density, where its coordinates do not do that already."""
+        density = glfw.get_window_content_scale(self._window)[0]
+        window, buffer = glfw.get_window_size(self._window)[0], glfw.get_framebuffer_size(self._window)[0]
+        scale = density * window / buffer if window and buffer else self._scale
+        if scale > 0 and abs(scale / self._scale - 1) > 0.01:
+            style = imgui.get_style()
+            style.scale_all_sizes(scale / self._scale)
+            style.font_scale_dpi = self._scale = scale
+
     def _clipboard(self) -> tuple[str, ...]:
         text = _text(glfw.get_clipboard_string(self._window) or "").strip()
         return (text,) if text else ()
@@ -196,18 +248,3 @@ class Screen:
 def _text(value: Any) -> str:
     """Return a text of glfw, which comes as bytes."""
     return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
-
-
-def _keys() -> tuple[frozenset[str], frozenset[str]]:
-    """Keys that went down in this frame, and keys that are down; Ctrl makes commands of them."""
-    io = imgui.get_io()
-
-    def those(test: Callable[[Any], bool]) -> set[str]:
-        return {name for name, key in KEY_NAMES.items() if test(getattr(imgui.Key, key))}
-
-    pressed = those(lambda key: imgui.is_key_pressed(key, False))
-    if io.key_ctrl:
-        commands = {"v": "paste", "q": "quit"}
-        return frozenset(commands[name] for name in pressed & commands.keys()), frozenset()
-    held = those(imgui.is_key_down) | ({"shift"} if io.key_shift else set())
-    return frozenset(pressed), frozenset(held)

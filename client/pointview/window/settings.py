@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from pointview.render import Style
+from pointview.render import Splat, Style
 
 if TYPE_CHECKING:
     from pointview.colouring import Mode
@@ -35,15 +35,20 @@ class Settings:
     mode : Mode
     tint : bool
         Starved pixels in yellow.
-    two_sided, oriented, close_holes : bool
+    splat : Splat
+    occlusion : bool
+        Leave out what is hidden, where that pays.
+    two_sided, close_holes : bool
         See `Style`.
     edl_strength : float
     fly : bool
         Dragging turns the head instead of the model.
     speed : float
         Of flying, sizes of the model a second.
-    panel, help : bool
-        What is shown.
+    up : {"y", "z"}, optional
+        The model's vertical; by its header if not given.
+    panel, help, marks : bool
+        What is shown; the marks are axes and scale bar.
     """
 
     tolerance: float = 1.0
@@ -53,20 +58,23 @@ class Settings:
     frame_seconds: float = 0.05
     mode: Mode = "color"
     tint: bool = False
+    occlusion: bool = True
+    splat: Splat = Style().splat
     two_sided: bool = False
-    oriented: bool = True
     close_holes: bool = True
     edl_strength: float = Style().edl_strength
     fly: bool = False
     speed: float = 0.25
+    up: Literal["y", "z"] | None = None
     panel: bool = True
+    marks: bool = True
     help: bool = False
 
     def style(self) -> Style:
         """Return the renderer's part."""
         return Style(
             two_sided=self.two_sided,
-            oriented=self.oriented,
+            splat=self.splat,
             close_holes=self.close_holes,
             edl_strength=self.edl_strength,
         )

@@ -58,6 +58,7 @@ def test_what_never_happened_is_said(small, tmp_path, capsys):
     [
         ("--link", "fast"), ("--link", "-1M"), ("--seconds", "0"), ("--seconds", "nan"), ("--seconds", "1e9"),
         ("--tolerance", "0"), ("--tolerance", "nan"), ("--tolerance", "inf"), ("--size", "12"), ("--clock", "wall"),
+        ("--prefetch", "maybe"),
         ("--priority", "size"), ("--view", "absent.json"), ("--view", "VIEW", "--path", "VIEW"),
     ],
 )  # fmt: skip

@@ -40,6 +40,7 @@ def test_build_serve_stream_and_five_figures(tmp_path, rooms):
     assert report["model"].startswith("http://127.0.0.1:")
     assert report["samples"] > 5000
     assert (out / "report" / "frame-0001.0s-starved.png").is_file()
+    assert f"Pictures at 1 and 2 s, and curve.png: {out / 'report'}" in result.stdout
     figures = result.stdout.split("\n\n")[-1].splitlines()
     assert len(figures) == 5
     assert re.search(rf"first picture +{report['first_picture_s']:.2f} s", figures[0])

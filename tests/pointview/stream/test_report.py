@@ -19,7 +19,8 @@ CONTRACT = [
     "curve",
 ]  # fmt: skip
 EXTRA = [
-    "model", "priority", "splat_rule", "occlusion", "occluded", "occlusion_note",
+    "model", "priority", "splat_rule", "occlusion", "occluded", "occlusion_note", "prefetch",
+    "speculative_bytes", "idle_bytes", "wasted_bytes",
     "size", "seconds", "model_samples", "model_bytes", "payload_bytes", "wanted_s",
     "frames", "errors",
 ]  # fmt: skip

@@ -55,17 +55,18 @@ def test_a_hand_at_the_window(screen, model_file, tmp_path):
         window = hand.window("torus")
         until(lambda: np.ptp(on_screen(screen)[200:300, 500:600]) > 100)  # the torus, right of the panel
         still = picture(1)
-        assert still.shape == (500, 700, 3)
+        assert still.shape[0] == 500  # beside the panel
+        assert 350 < still.shape[1] < 420
         assert covered(still) > 0.1
 
         hand.do("key", "r")
-        hand.drag((520, 250), (420, 290))
+        hand.drag((560, 250), (460, 290))
         time.sleep(0.3)
         hand.do("key", "r")
         until(lambda: list(tmp_path.glob("torus-path-*.json")))
         assert (picture(2) != still).any(axis=2).mean() > 0.05
 
-        hand.do("mousemove", 470, 250)
+        hand.do("mousemove", 500, 250)
         hand.do("click", "--repeat", 5, "--delay", 60, 4)
         assert covered(picture(3)) > 1.15 * covered(still)
 
@@ -76,7 +77,10 @@ def test_a_hand_at_the_window(screen, model_file, tmp_path):
         assert (picture(5) != still).any(axis=2).mean() > 0.05
 
         hand.do("windowsize", window, 600, 420)
-        assert picture(6).shape == (420, 600, 3)
+        assert picture(6).shape == (420, 600, 3)  # so narrow that the panel stands on it
+
+        hand.do("key", "Tab", "u")
+        assert (picture(7) != on_screen(screen)[:420, :600]).any(axis=2).mean() < 0.1  # axes and scale
 
         hand.do("key", "ctrl+q")
         out, problems = process.communicate(timeout=30)
@@ -136,10 +140,12 @@ def test_no_frame_waits_for_the_network(screen, model_file):
 
 
 def test_an_unreachable_model_is_a_message_not_a_wait(screen, tmp_path):
-    with viewing(screen, tmp_path / "none.lpc", "--seconds", 1.5, "--size", "300x200") as process:
+    noise = tmp_path / "noise.lpc"
+    noise.write_bytes(bytes(range(256)) * 300)
+    with viewing(screen, noise, "--seconds", 1.5, "--size", "300x200") as process:
         _, problem = process.communicate(timeout=60)
     assert process.returncode == 1
-    assert "none.lpc" in problem
+    assert "noise.lpc" in problem
 
 
 def test_without_a_display_it_says_so(model_file):
@@ -147,4 +153,12 @@ def test_without_a_display_it_says_so(model_file):
         _, problem = process.communicate(timeout=60)
     assert process.returncode == 1
     assert "no window can be opened here" in problem
+    assert problem.count("\n") == 1
+
+
+def test_a_missing_file_is_said_before_a_missing_display(tmp_path):
+    with viewing("", tmp_path / "none.lpc") as process:
+        _, problem = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert problem.endswith("none.lpc: there is no such file\n")
     assert problem.count("\n") == 1

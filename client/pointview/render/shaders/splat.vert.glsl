@@ -2,6 +2,7 @@
 //
 // COMMANDS: the cloud's parameters arrive as per-instance attributes, chosen by the base instance of an indirect
 // command. Without it they are uniforms, and every cloud is a draw of its own (OpenGL 3.3 to 4.2).
+// BLENDED: its shape is that of a kernel (see blend_kernels.gather).
 
 in vec4 vertex;      // x, y, z in steps; two octahedral bytes
 in vec4 color;       // 0 to 1
@@ -39,14 +40,21 @@ uniform vec3 lamp;         // camera space
 uniform bool lit;
 uniform bool two_sided;
 
-flat out vec3 rgb;
 flat out vec3 center;      // camera space
 flat out vec2 middle;      // the same on the picture, pixels, y up
 flat out vec3 plane;       // normal of a disc's plane
+#ifdef BLENDED
+flat out vec3 linear;
+flat out vec3 form;
+flat out float share;
+flat out float farthest;
+#else
+flat out vec3 rgb;
 flat out float extent;     // half a side, pixels; of a disc its radius, model units
 flat out float side;
 flat out int kind;
 flat out int seen;
+#endif
 
 const float AMBIENT = @AMBIENT@;
 const float DIFFUSE = @DIFFUSE@;
@@ -55,6 +63,7 @@ const float SHININESS = @SHININESS@;
 const float UNLIT = @UNLIT@;
 
 const int STARVED = 1 << 30;
+const float PIXEL2 = @PIXEL@ * @PIXEL@;
 
 vec4 texel(int i) {
     return texelFetch(places, ivec2(i & 1023, i >> 10), 0);
@@ -135,6 +144,26 @@ vec3 disc_plane(vec3 n) {
     return normalize(n - max(steepest - facing, 0.0) * away);
 }
 
+#ifdef BLENDED
+// The kernel of a sample whose splat has such a side.
+void shape_kernel(float side) {
+    vec2 slope = center.xy / center.z;
+    float spread = @KERNEL@ * side;
+    vec2 lean = plane.xy - slope * plane.z;
+    vec2 own = max(1.0 + slope * slope - lean * lean, 0.0);
+    float along = dot(plane, vec3(slope, 1.0));
+    float spread2 = spread * spread;
+    float det = spread2 * along * spread2 * along + PIXEL2 * (spread2 * (own.x + own.y) + PIXEL2);
+    own = spread2 * own + PIXEL2;
+    form = vec3(own.yx, spread2 * (lean.x * lean.y - slope.x * slope.y)) / det;
+    float radius = @KERNEL_ENDS@ * spread / focal;
+    vec2 half_size = @KERNEL_ENDS@ / (1.0 - min(radius, 0.5)) * sqrt(own);
+    gl_PointSize = ceil(2.0 * max(half_size.x, half_size.y)) + 1.0;
+    share = spread2 * abs(along) / sqrt(det);
+    farthest = center.z * @BEHIND@ * max(radius, 1.0 / focal) / max(abs(along), @SLANTED@);
+}
+#endif
+
 void drop() {
     gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
     gl_PointSize = 1.0;
@@ -156,8 +185,7 @@ void main() {
     }
     normal = normalize(rotation * normal);
     vec2 shade = lit ? (has_normal ? light(normal) : vec2(UNLIT, 0.0)) : vec2(1.0, 0.0);
-    rgb = min(color.rgb * albedo * shade.x + shade.y, 1.0);
-    seen = cloud_numbers.x;
+    vec3 lit_color = min(color.rgb * albedo * shade.x + shade.y, 1.0);
     middle = 0.5 * size + center.xy * (focal / depth);
     float across = cloud_corner.w;
     bool starved = cloud_numbers.y >= STARVED;
@@ -167,6 +195,15 @@ void main() {
         across = abs(spacing) * closing;
         starved = spacing < 0.0;
     }
+    gl_Position = vec4(2.0 * (middle + margin) / (size + 2.0 * margin) - 1.0, 0.0, 1.0);
+#ifdef BLENDED
+    vec3 level = floor(255.0 * lit_color + 0.5) / 255.0;
+    linear = mix(pow((level + 0.055) / 1.055, vec3(2.4)), level / 12.92, lessThanEqual(level, vec3(0.04045)));
+    plane = oriented && has_normal ? disc_plane(normal) : vec3(0.0, 0.0, -1.0);
+    shape_kernel(min(across / depth, largest));
+#else
+    rgb = lit_color;
+    seen = cloud_numbers.x;
     side = min(across / depth, largest);
     extent = 0.5 * side * (side > round_from ? round_factor : 1.0);
     gl_PointSize = ceil(2.0 * extent) + 1.0;
@@ -188,7 +225,7 @@ void main() {
     } else {
         kind = BALL;
     }
-    gl_Position = vec4(2.0 * (middle + margin) / (size + 2.0 * margin) - 1.0, 0.0, 1.0);
     if (starved)
         side = -max(side, 1e-6);
+#endif
 }
