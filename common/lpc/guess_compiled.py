@@ -52,9 +52,10 @@ def _inside(position: Any, low: Any, high: Any, away: Any, place: Any, index: An
     count = 0
     for i in range(len(position)):
         x, y, z = np.int64(position[i, 0]), np.int64(position[i, 1]), np.int64(position[i, 2])
-        place[0, count], place[1, count], place[2, count] = x + away[0], y + away[1], z + away[2]
-        index[count] = i
-        count += (low[0] <= x) & (x <= high[0]) & (low[1] <= y) & (y <= high[1]) & (low[2] <= z) & (z <= high[2])
+        if low[0] <= x <= high[0] and low[1] <= y <= high[1] and low[2] <= z <= high[2]:
+            place[0, count], place[1, count], place[2, count] = x + away[0], y + away[1], z + away[2]
+            index[count] = i
+            count += 1
     return count
 
 

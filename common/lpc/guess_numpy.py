@@ -36,18 +36,14 @@ def inside(
     position: NDArray[np.uint16], low: tuple[int, int, int], high: tuple[int, int, int], away: tuple[int, int, int]
 ) -> tuple[Ints, NDArray[np.intp]]:
     """Coordinates plus `away` of the samples from `low` to `high`, (3, n), and their numbers."""
-    columns = [position[:, axis] for axis in range(3)]
+    columns = position.T.copy()  # faster than the array as it is
     # Below `low` a difference wraps around: one comparison sees both ends.
-    x, y, z = (
-        (column - np.uint16(least)) <= np.uint16(most - least)
-        for column, least, most in zip(columns, low, high, strict=True)
-    )
-    x &= y
-    x &= z
-    index = np.flatnonzero(x)
+    columns -= np.array(low, np.uint16)[:, None]
+    outside = columns > np.array(high, np.uint16)[:, None] - np.array(low, np.uint16)[:, None]
+    index = np.flatnonzero(~outside.any(axis=0))
     place = np.empty((3, len(index)), np.int32)
-    for column, add, out in zip(columns, away, place, strict=True):
-        np.add(column.take(index), np.int32(add), out=out)
+    for column, least, add, out in zip(columns, low, away, place, strict=True):
+        np.add(column.take(index), np.int32(least + add), out=out)
     return place, index
 
 
@@ -68,10 +64,8 @@ def add_guesses(
                 values[three, part], codes = _add_normal(sums[three, part], residual, bits)
                 rows[first : first + 2, part] = codes
             else:
-                codes = (_mean(sums[three, part], total[part]) + rows[first : first + 3, part].view(np.int32)).view(
-                    np.uint32
-                )
-                codes &= _masks(bits)
+                residual = rows[first : first + 3, part].view(np.int32)
+                codes = (_mean(sums[three, part], total[part]) + residual).view(np.uint32) & _masks(bits)
                 rows[first : first + 3, part] = codes
                 values[three, part] = _signed(codes, bits)
     for field, (first, normal, bits) in enumerate(channels.guessed.tolist()):
