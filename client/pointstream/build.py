@@ -5,12 +5,14 @@ When the host changes the model, all of this is replaced by a new one in one ste
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from lpc.context import ANCESTORS
 from lpc.ranges import ByteRange
 
+from .lineage import ancestors
 from .offers import Item
 from .residency import Residency
 
@@ -18,9 +20,18 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from lpc.cloud import Cloud
+    from lpc.errors import Corrupt
     from lpc.index import IndexTree
 
     from .stores import Store
+
+
+class Arrived(NamedTuple):
+    """A cloud's bytes, and how many of them came ahead of any want."""
+
+    item: Item
+    data: bytes
+    ahead: int
 
 
 class Build:
@@ -44,6 +55,8 @@ class Build:
         Arrived and being decoded.
     held : ndarray, (nodes,) bool
         The store has them without asking over a link.
+    waiting : dict of int to list
+        What arrived and can be decoded after a node that is not here yet, by that node.
     tail : (int, bytes)
         The start of an object that the opening cut in two, and where in the file it begins; given out once.
     """
@@ -57,6 +70,7 @@ class Build:
         self.held: NDArray[np.bool_] = np.zeros(len(index), dtype=bool)
         self.length = index.header.bytes if store.length is None else min(index.header.bytes, store.length)
         self.lost_pages: set[int] = set()
+        self.waiting: dict[int, list[Arrived]] = {}
         self.tail: tuple[int, bytes] = (0, b"")
         self._failures: dict[int, int] = {}
         for page in np.flatnonzero(index.page_loaded).tolist():
@@ -69,6 +83,7 @@ class Build:
         stops = self.index.offset[rows] + self.index.size[rows]
         self.held[rows] = self._store.holds(self.index.offset[rows], stops)
         self.absent[rows] = (stops > self.length) | (self._store.partial & ~self.held[rows])
+        self._bereave(np.arange(rows.start, min(rows.stop, len(self.index))))
 
     def take_tail(self, wanted: ByteRange) -> bytes:
         """Give the first bytes of a range, if they came with the opening and others are still to come."""
@@ -107,7 +122,40 @@ class Build:
             self.lost_pages.add(~key)
         else:
             self.absent[key] = True
+            below = self.index.children[[key]]
+            while (below := below[below >= 0]).size:
+                self._bereave(below.astype(np.int64))
+                below = self.index.children[below]
         return True
+
+    def family(self, node: int) -> dict[int, Cloud | Corrupt] | int:
+        """Give the clouds that a node's is told from, or the first of them that is not here."""
+        line = ancestors(self.index, node)
+        for above in line:
+            if above not in self.clouds:
+                return above
+        return {above: self.clouds[above] for above in line}
+
+    def _with_ancestors(self, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Put before nodes those that are not here and without which they cannot be decoded."""
+        if all(attribute.kind == "scalar" for attribute in self.index.header.attributes):
+            return nodes
+        needed, line = [], nodes
+        for _ in range(ANCESTORS):
+            line = np.unique(self.index.parent[line[self.index.linked[line]]]).astype(np.int64)
+            line = line[line >= 0]
+            needed.append(line[~self.residency.resident[line]])
+        above = np.unique(np.concatenate(needed))
+        above = above[~np.isin(above, nodes)]
+        return np.concatenate([self._with_ancestors(above), nodes]) if len(above) else nodes
+
+    def _bereave(self, nodes: NDArray[np.int64]) -> None:
+        """Mark nodes as absent, in their order, whose parents are: nothing tells their clouds."""
+        if all(attribute.kind == "scalar" for attribute in self.index.header.attributes):
+            return
+        nodes = nodes[self.index.known[nodes] & self.index.linked[nodes] & (nodes > 0)]
+        while len(lost := nodes[self.absent[self.index.parent[nodes]] & ~self.absent[nodes]]):
+            self.absent[lost] = True
 
     def missing(self, wants: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Split wants into what can be had and is not here.
@@ -121,7 +169,7 @@ class Build:
         """
         known = self.index.known[wants]
         nodes = wants[known]
-        nodes = nodes[~(self.residency.resident[nodes] | self.absent[nodes])]
+        nodes = self._with_ancestors(nodes[~(self.residency.resident[nodes] | self.absent[nodes])])
         pages = self.index.missing_pages(wants[~known]) if not known.all() else np.empty(0, dtype=np.int64)
         here = [page for page in pages.tolist() if page not in self.lost_pages and self.has(self.page_item(page))]
         return np.array(here, dtype=np.int64), nodes

@@ -7,7 +7,7 @@ memory holds a few runs whatever the size of the model.
 from __future__ import annotations
 
 import asyncio
-from collections import deque
+from collections import ChainMap, deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,6 +20,7 @@ from lpc.page import page_bytes
 from lpc.ranges import ByteRange, coalesce
 
 from .decoding import decode_checked
+from .lineage import Family, Lineage, ancestors
 from .opening import add_page, open_index
 
 if TYPE_CHECKING:
@@ -47,6 +48,8 @@ class ReadingOptions:
         That decode.
     tries : int
         Fetches of something that fails its checks.
+    family_bytes : int
+        Decoded clouds to keep, because others are told from them.
     """
 
     max_gap: int = 4096
@@ -54,6 +57,7 @@ class ReadingOptions:
     parallel: int = 4
     threads: int = 2
     tries: int = 3
+    family_bytes: int = 1 << 27
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -222,16 +226,15 @@ class Reader:
         ranges = [self.index.cloud_range(node) for node in nodes.tolist()]
         plan = coalesce(ranges, self.options.max_gap, self.options.max_bytes)
         plan.sort(key=lambda run: run[0].start)
+        lineage = Lineage(self.index, self.options.family_bytes)
         with ThreadPoolExecutor(self.options.threads, thread_name_prefix="decode") as threads:
-            going: deque[asyncio.Task[list[tuple[int, Cloud | Corrupt]]]] = deque()
+            going: deque[asyncio.Task[bytes]] = deque()
             try:
-                for place, members in plan:
-                    going.append(asyncio.create_task(self._run(threads, place, nodes[members].tolist())))
-                    if len(going) >= self.options.parallel:
-                        for pair in await going.popleft():
-                            yield pair
-                while going:
-                    for pair in await going.popleft():
+                for number, (place, members) in enumerate(plan):
+                    for ahead, _ in plan[number + len(going) : number + self.options.parallel]:
+                        going.append(asyncio.create_task(self.read(ahead)))
+                    body = await going.popleft()
+                    for pair in await self._decode_run(threads, lineage, place, body, nodes[members].tolist()):
                         yield pair
             finally:
                 for task in going:
@@ -291,30 +294,46 @@ class Reader:
             add_page(self.index, page, data)
         self.store.vouch(place, data)
 
-    async def _run(
-        self, threads: ThreadPoolExecutor, place: ByteRange, nodes: list[int]
+    async def _decode_run(
+        self, threads: ThreadPoolExecutor, lineage: Lineage, place: ByteRange, body: bytes, nodes: list[int]
     ) -> list[tuple[int, Cloud | Corrupt]]:
-        body = await self.read(place)
+        """Decode the nodes of a run, after those of their ancestors that are not at hand."""
+        family, missing = lineage.family(nodes)
+        order = sorted([*nodes, *missing])
+        parts = {node: bytes(place.within(body, self.index.cloud_range(node))) for node in nodes}
+        for start in range(0, len(missing), self.options.parallel):
+            some = missing[start : start + self.options.parallel]
+            bodies = await self._together([self.index.cloud_range(node) for node in some])
+            parts |= dict(zip(some, bodies, strict=True))
         loop = asyncio.get_running_loop()
-        parts = [bytes(place.within(body, self.index.cloud_range(node))) for node in nodes]
-        clouds = await loop.run_in_executor(threads, self._decode, nodes, parts)
-        for number, node in enumerate(nodes):
-            place = self.index.cloud_range(node)
-            for _ in range(self.options.tries - 1):
-                if not isinstance(clouds[number], Corrupt):
+        # Those of one run are as a rule no ancestors of each other.
+        apart = not missing and all(int(self.index.parent[node]) < order[0] for node in order)
+        cut = len(order) // 2 if apart and self.options.threads > 1 else 0
+        halves = [half for half in (order[:cut], order[cut:]) if half]
+        for found in await asyncio.gather(
+            *(loop.run_in_executor(threads, self._decode, half, parts, family) for half in halves)
+        ):
+            family |= found
+        for node in order:
+            for _ in range(self.options.tries):
+                if not isinstance(family[node], Corrupt):
                     break
-                self._reject(place)
-                parts[number] = await self.read(place)
-                clouds[number : number + 1] = await loop.run_in_executor(threads, self._decode, [node], [parts[number]])
-            if not isinstance(clouds[number], Corrupt):
-                self.store.vouch(place, parts[number])
-        return list(zip(nodes, clouds, strict=True))
+                if not any(isinstance(family[above], Corrupt) for above in ancestors(self.index, node)):
+                    self._reject(self.index.cloud_range(node))
+                    parts[node] = await self.read(self.index.cloud_range(node))
+                family |= await loop.run_in_executor(threads, self._decode, [node], parts, family)
+            if not isinstance(family[node], Corrupt):
+                self.store.vouch(self.index.cloud_range(node), parts[node])
+        lineage.keep(family)
+        return [(node, family[node]) for node in nodes]
 
-    def _decode(self, nodes: list[int], parts: list[bytes]) -> list[Cloud | Corrupt]:
-        clouds: list[Cloud | Corrupt] = []
-        for node, part in zip(nodes, parts, strict=True):
+    def _decode(self, nodes: list[int], parts: dict[int, bytes], family: Family) -> Family:
+        """Decode nodes, coarse first; `family` has the ancestors that are not among them."""
+        found: Family = {}
+        known = ChainMap(found, family)
+        for node in nodes:
             try:
-                clouds.append(decode_checked(part, node=node, index=self.index))
+                found[node] = decode_checked(parts[node], node=node, index=self.index, family=known)
             except Corrupt as error:
-                clouds.append(error)
-        return clouds
+                found[node] = error
+        return found

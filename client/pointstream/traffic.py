@@ -16,7 +16,7 @@ from lpc.header import HEADER_PROBE
 from lpc.ranges import ByteRange
 
 from .arrivals import Assembly
-from .build import Build
+from .build import Arrived, Build
 from .decoding import Decoder
 from .foresight import Foresight
 from .offers import Item, Request
@@ -218,6 +218,8 @@ class Traffic:
         finally:
             self._probing = False
             scheduler.ended(request)
+            if build is not None:
+                self._forget_orphans(build)
         self.issue()
 
     def _begin(self, opening: Opening, data: bytearray) -> Build:
@@ -267,6 +269,7 @@ class Traffic:
             self._failed(error)
         finally:
             scheduler.ended(request)
+            self._forget_orphans(build)
         self.issue()
 
     def _land(self, scheduler: Scheduler, request: Request, assembly: Assembly, offset: int, chunk: bytes) -> None:
@@ -288,10 +291,35 @@ class Traffic:
                 self._page_arrived(build, ~item.key, data, request, assembly)
             elif not build.residency.resident[item.key] and not build.busy[item.key]:
                 build.busy[item.key] = True
-                done = partial(self._decoded, build, item, data, ahead=request.brings(item) if request.ahead else 0)
-                self.decoder.decode(data, node=item.key, index=build.index, done=done)
+                self._decode(build, Arrived(item, data, request.brings(item) if request.ahead else 0))
         if arrived:
             self.issue()
+
+    def _decode(self, build: Build, came: Arrived) -> None:
+        """Decode a cloud once those that it is told from are here."""
+        family = build.family(came.item.key)
+        if isinstance(family, int):
+            build.waiting.setdefault(family, []).append(came)
+            return
+        done = partial(self._decoded, build, came.item, came.data, ahead=came.ahead)
+        self.decoder.decode(came.data, node=came.item.key, index=build.index, family=family, done=done)
+
+    def _go_on(self, build: Build, node: int) -> None:
+        """Decode what waited for a node."""
+        for came in build.waiting.pop(node, []):
+            self._decode(build, came)
+
+    def _forget_orphans(self, build: Build) -> None:
+        """Let go of what waits for nodes that are not on their way: it will be wanted again."""
+        lost = [
+            node
+            for node in build.waiting
+            if not (build.busy[node] or self.scheduler.flies(node) or self.local.flies(node))
+        ]
+        while lost:
+            for came in build.waiting.pop(lost.pop(), []):
+                build.busy[came.item.key] = False
+                lost.append(came.item.key)
 
     def _page_arrived(self, build: Build, page: int, data: bytes, request: Request, assembly: Assembly) -> None:
         try:
@@ -319,6 +347,7 @@ class Traffic:
             return
         if isinstance(cloud, Corrupt):
             self._damaged(build, item.key, cloud)
+            self._forget_orphans(build)
         else:
             self.payload += len(data) * build.passed(item, data)
             if ahead:
@@ -326,6 +355,7 @@ class Traffic:
             undrawn = ahead > 0 and not self.wanted.holds(item.key)
             self.foresight.dropped(build.add(item.key, cloud, ahead=undrawn))
             self.wanted.came(self._clock(), item.key)
+            self._go_on(build, item.key)
         self.issue()
 
     def _damaged(self, build: Build, key: int, error: FormatError) -> None:
