@@ -18,7 +18,8 @@ from scipy.spatial import cKDTree
 
 from lpc.attributes import Attribute, Schema
 from lpc.channels import channels_of
-from lpc.codec import decode_cloud, encode_cloud
+from lpc.codec import decode_cloud, encode_clouds
+from lpc.context import ANCESTORS
 from lpc.lattice import position_step, quantise
 from lpc.octahedral import encode_normals
 from lpc.payload import RAW_BITS, parse_layout
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
+
+    from lpc.cloud import Cloud
 
 NORMAL = Attribute(name="normal", kind="normal", dtype="<f4", bits=8)
 COLOR = Attribute(name="color", kind="color", dtype="|u1", bits=8)
@@ -91,12 +94,14 @@ def model_spacing(xyz: NDArray[np.float64], seed: int) -> float:
     return float(np.median(cKDTree(xyz).query(some, 9)[0][:, 8]) * np.sqrt(np.pi / 8))
 
 
-def clouds(xyz: NDArray[np.float64], size: int, seed: int) -> Iterator[NDArray[np.int64]]:
-    """Sample numbers of each node."""
-    todo = [(np.random.default_rng(seed).permutation(len(xyz)), xyz.min(axis=0), xyz.max(axis=0))]
+def clouds(xyz: NDArray[np.float64], size: int, seed: int) -> Iterator[tuple[NDArray[np.int64], int]]:
+    """Sample numbers of each node, and the number of its parent; -1 for the root."""
+    todo = [(np.random.default_rng(seed).permutation(len(xyz)), xyz.min(axis=0), xyz.max(axis=0), -1)]
+    count = 0
     while todo:
-        members, low, high = todo.pop()
-        yield members[:size]
+        members, low, high, parent = todo.pop()
+        yield members[:size], parent
+        number, count = count, count + 1
         rest = members[size:]
         if len(rest):
             axis = int(np.argmax(high - low))
@@ -106,7 +111,7 @@ def clouds(xyz: NDArray[np.float64], size: int, seed: int) -> Iterator[NDArray[n
                 cut = bound.copy()
                 cut[axis] = middle
                 if len(side):
-                    todo.append((side, low, cut) if which else (side, cut, high))
+                    todo.append((side, low, cut, number) if which else (side, cut, high, number))
 
 
 def stream_bits(frame: bytes, samples: int, schema: Schema) -> dict[str, float]:
@@ -150,11 +155,15 @@ def measure(path: Path, size: int, effort: str, repeats: int, with_color: bool) 
     schema: Schema = (NORMAL,)
     if with_color and color is not None:
         schema, codes["color"] = (NORMAL, COLOR), color
-    parts = [(lattice[which], {name: code[which] for name, code in codes.items()}) for which in clouds(xyz, size, 2)]
+    parts = list(clouds(xyz, size, 2))
     counts = [len(part) for part, _ in parts]
+    parents = [parent for _, parent in parts]
+    order = np.concatenate([part for part, _ in parts])
+    bounds = np.concatenate([[0], np.cumsum(counts)])
+    lattice, codes = lattice[order], {name: code[order] for name, code in codes.items()}
 
     def encode() -> list[bytes]:
-        return [encode_cloud(part, code, schema, effort=effort) for part, code in parts]
+        return encode_clouds(lattice, codes, bounds, schema, parent=np.array(parents), effort=effort)
 
     frames = encode()
     totals: dict[str, float] = {}
@@ -165,8 +174,13 @@ def measure(path: Path, size: int, effort: str, repeats: int, with_color: bool) 
     for engine in ("compiled", "numpy"):
 
         def decode(engine: str = engine) -> None:
-            for frame, count in zip(frames, counts, strict=True):
-                decode_cloud(frame, samples=count, schema=schema, engine=engine)
+            known: list[Cloud] = []
+            for frame, count, parent in zip(frames, counts, parents, strict=True):
+                line: list[Cloud] = []
+                while parent >= 0 and len(line) < ANCESTORS:
+                    line.append(known[parent])
+                    parent = parents[parent]
+                known.append(decode_cloud(frame, samples=count, schema=schema, context=line[::-1], engine=engine))
 
         decode()
         speeds.append(rate(decode, len(xyz), repeats))

@@ -140,14 +140,23 @@ class Build:
         """Put before nodes those that are not here and without which they cannot be decoded."""
         if all(attribute.kind == "scalar" for attribute in self.index.header.attributes):
             return nodes
-        needed, line = [], nodes
-        for _ in range(ANCESTORS):
-            line = np.unique(self.index.parent[line[self.index.linked[line]]]).astype(np.int64)
-            line = line[line >= 0]
-            needed.append(line[~self.residency.resident[line]])
-        above = np.unique(np.concatenate(needed))
-        above = above[~np.isin(above, nodes)]
-        return np.concatenate([self._with_ancestors(above), nodes]) if len(above) else nodes
+        resident, parent = self.residency.resident, self.index.parent
+        line, rank = nodes[self.index.linked[nodes]], np.flatnonzero(self.index.linked[nodes])
+        left = np.full(len(line), ANCESTORS)
+        found, ranks = [nodes], [np.arange(len(nodes))]
+        while len(line):
+            line = parent[line].astype(np.int64)
+            here = resident[line] & (line >= 0)
+            left = np.where(here, left - 1, ANCESTORS)  # whoever is not here needs its own, too
+            up = (line >= 0) & (left > 0)
+            line, rank, left, here = line[up], rank[up], left[up], here[up]
+            found.append(line[~here])
+            ranks.append(rank[~here])
+        keys = np.concatenate(found)
+        order = np.lexsort((keys, np.concatenate(ranks)))  # as urgent as the most urgent of its descendants
+        keys = keys[order]
+        _, first = np.unique(keys, return_index=True)
+        return keys[np.sort(first)]
 
     def _bereave(self, nodes: NDArray[np.int64]) -> None:
         """Mark nodes as absent, in their order, whose parents are: nothing tells their clouds."""
