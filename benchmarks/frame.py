@@ -3,8 +3,8 @@
 The clouds have 12 samples each and the picture is small, so what is measured is the work per cloud: traversal, memory
 management and submission, and not the splats. OpenGL is measured until all commands are submitted, with the indirect
 multi-draw of 4.3 and with the loop of draws that 3.3 needs; a driver in software does the work of the vertices inside
-these calls, so what the one call of the multi-draw takes is shown apart. Times are medians over frames of a turning
-camera, of the calling thread's CPU.
+these calls, so what the one call of the multi-draw takes is shown apart; of the loop it is part of the figure. Times
+are medians over frames of a turning camera, of the calling thread's CPU.
 """
 
 from __future__ import annotations
@@ -73,16 +73,19 @@ def _gl(model: models.Model, cuts: list[Any], one_draw: bool) -> tuple[float, fl
 
         def submit(turn: int) -> None:
             cut, camera = cuts[turn]
-            backend._begin_splats(cut, camera, STYLE)  # noqa: SLF001
             backend._write_places(cut)  # noqa: SLF001
-            backend._submit(cut, slice(0, len(cut.nodes)), camera)  # noqa: SLF001
+            samples.tell(backend._told(cut, camera, STYLE))  # noqa: SLF001
+            backend._submit(samples, cut, slice(0, len(cut.nodes)), camera)  # noqa: SLF001
 
         def draw(_turn: int) -> None:
-            backend._points.render_indirect(backend._commands, moderngl.POINTS, clouds)  # noqa: SLF001
+            samples.points.render_indirect(backend._commands, moderngl.POINTS, clouds)  # noqa: SLF001
 
+        samples = backend._splats  # noqa: SLF001
         finish, clouds = backend._context.finish, len(cuts[-1][0].nodes)  # noqa: SLF001
-        submission = _median(submit, after=finish)
-        return _median(cache), submission, _median(draw, after=finish) if one_draw else 0.0
+        with backend._context:  # noqa: SLF001
+            backend._splatted.target.use()  # noqa: SLF001
+            submission = _median(submit, after=finish)
+            return _median(cache), submission, _median(draw, after=finish) if one_draw else 0.0
     finally:
         backend.close()
 

@@ -127,7 +127,7 @@ def stream(model: Path, report: Path) -> dict[str, Any]:
 
 def picture(model: Path, out: Path) -> Image.Image:
     """Render the whole model as `stream` sees it."""
-    run([*COMMAND, "render", model, out, "--size", "1024x768", "--json"])
+    run([*COMMAND, "render", model, out, "--size", "1024x768", "--splat", "disc", "--json"])
     return Image.open(out).convert("RGB")
 
 

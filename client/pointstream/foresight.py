@@ -20,15 +20,12 @@ class Foresight:
 
     Attributes
     ----------
-    received : int
-        Bytes that came ahead.
-    idle : int
-        Bytes among them that came while no frame wanted anything.
-    used : int
+    received, used : int
+        Bytes that came ahead, and those among them that were used.
     """
 
     def __init__(self) -> None:
-        self.received = self.idle = self.used = 0
+        self.received = self.used = 0
         self._sizes: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
         self._pages: dict[int, int] = {}
         self._page_nodes = 1
@@ -43,10 +40,9 @@ class Foresight:
         """Bytes that came ahead and were not used."""
         return self.received - self.used
 
-    def landed(self, nbytes: int, *, wanting: bool) -> None:
-        """Count bytes; `wanting` tells whether any frame waits for something meanwhile."""
+    def landed(self, nbytes: int) -> None:
+        """Count bytes that came ahead."""
         self.received += nbytes
-        self.idle += 0 if wanting else nbytes
 
     def came(self, key: int, size: int) -> None:
         """Note that a cloud (or page ``~key``) of those bytes, `size` of them, is complete and can be used."""

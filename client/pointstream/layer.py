@@ -103,7 +103,7 @@ class AccessLayer:
             requests=self._traffic.requests if meter is None else meter.requests,
             payload_bytes=self._traffic.payload,
             speculative_bytes=self._traffic.foresight.received,
-            idle_bytes=self._traffic.foresight.idle,
+            idle_bytes=self._traffic.idle_bytes,
             wasted_bytes=self._traffic.foresight.wasted,
             in_flight=self._traffic.scheduler.in_flight,
             outstanding_bytes=self._traffic.scheduler.outstanding,

@@ -34,10 +34,10 @@ class LayerStats:
         Body bytes and requests, retries included.
     payload_bytes : int
         Bytes of header, pages and clouds that arrived whole, passed their checks and were used.
+    idle_bytes : int
+        Body bytes that came while no frame wanted anything.
     speculative_bytes : int
         Body bytes of requests that were made before any frame wanted what they bring.
-    idle_bytes : int
-        Those among them that came while no frame wanted anything.
     wasted_bytes : int
         Those among them that no frame has drawn (`foresight`).
     in_flight, outstanding_bytes : int
@@ -62,8 +62,8 @@ class LayerStats:
     bytes_received: int
     requests: int
     payload_bytes: int
-    speculative_bytes: int
     idle_bytes: int
+    speculative_bytes: int
     wasted_bytes: int
     in_flight: int
     outstanding_bytes: int

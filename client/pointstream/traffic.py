@@ -54,6 +54,8 @@ class Traffic:
     errors : ErrorLog
     received, requests, payload : int
         Bytes that came, requests that brought any, bytes that were used.
+    idle_bytes : int
+        Bytes that came while no frame wanted anything: ahead, or for a view that the camera has left.
     stopped : bool
         Nothing is asked for any more.
     """
@@ -67,7 +69,7 @@ class Traffic:
         self.wanted = Wanted(clock())
         self.foresight = Foresight()
         self.errors = ErrorLog()
-        self.received = self.requests = self.payload = 0
+        self.received = self.requests = self.payload = self.idle_bytes = 0
         self.stopped = False
         self._options, self._clock = options, clock
         self._recovery = Recovery(options.recovery)
@@ -277,7 +279,9 @@ class Traffic:
             self.requests += 1
         self.received += len(chunk)
         if request.ahead:
-            self.foresight.landed(len(chunk), wanting=self.wanted.anything)
+            self.foresight.landed(len(chunk))
+        if not self.wanted.anything:
+            self.idle_bytes += len(chunk)
         scheduler.landed(request, assembly.feed(offset, chunk))
 
     def _arrive(self, build: Build, request: Request, assembly: Assembly) -> None:

@@ -111,9 +111,9 @@ TOLERANCE = click.option(
 @click.option(
     "--splat",
     type=click.Choice(["square", "round", "disc", "blended"]),
-    default="disc",
+    default="blended",
     show_default=True,
-    help="What samples look like; blended shows the mean of them.",
+    help="What samples look like; blended: a pixel shows the mean of its samples.",
 )
 @click.option(
     "--antialias",
@@ -230,10 +230,11 @@ def _sequence(
     def views_of(header: Header) -> list[dict[str, Any]]:
         if along is not None:
             return along
-        size = {"width": options.width, "height": options.height}
+        width, height = options.width, options.height
         if options.view is not None:
-            return turntable_views(Camera.from_view(options.view, **size), turntable or 1)
-        return turntable_views(Camera.frame_model(header, **size), turntable or 1, header.bounds)
+            return turntable_views(Camera.from_view(options.view, width=width, height=height), turntable or 1)
+        camera = Camera.frame_model(header, width=width, height=height)
+        return turntable_views(camera, turntable or 1, header.bounds)
 
     with progress("drawing", turntable or len(along or ())) as step:
         report = asyncio.run(

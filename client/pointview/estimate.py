@@ -11,7 +11,7 @@ costs `overhead` bytes of heads besides its body. Opening costs a round trip for
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +38,10 @@ if TYPE_CHECKING:
     from pointstream.scheduler import SchedulerOptions
 
 
+LEFT_OUT = {"occlusion": "only pictures tell what is hidden: counted as seen, a stream with --occlusion may need less"}
+"""What an estimate does not know, and why."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
     """The cost of a view.
@@ -59,6 +63,8 @@ class Estimate:
         What the estimate itself read.
     max_spacing_px : float
         What the view ends at: above the tolerance only where the model has no finer clouds.
+    left_out : dict of str to str
+        What was not reckoned with, and why.
     """
 
     tolerance: float
@@ -73,6 +79,7 @@ class Estimate:
     rtt: float | None
     bytes_read: int
     max_spacing_px: float
+    left_out: Mapping[str, str] = field(default_factory=LEFT_OUT.copy)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -57,3 +57,5 @@ def estimate(
         time += f" at {found.rate / 1e3:,.1f} kB/s"
     click.echo(f"time            {time}")
     click.echo(f"read for this   {found.bytes_read:,} bytes")
+    for name, why in found.left_out.items():
+        click.echo(f"{name:<15} {why}")

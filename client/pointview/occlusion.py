@@ -86,7 +86,12 @@ class Occlusion:
         """Why nothing is culled, or None while culling is on."""
         if self._pause == 0:
             return None
-        return f"occlusion culling is paused: {100 * self._share:.0f}% of the nodes are hidden, it would cost more"
+        return f"occlusion culling is paused: {100 * self._share:.0f}% of the nodes are hidden, tests cost more"
+
+    @property
+    def left_out(self) -> dict[str, str]:
+        """The verdict as reports state it: what is left out, and why."""
+        return {} if self.verdict is None else {"occlusion": self.verdict}
 
     def look(self, index: IndexTree, cut: Cut, camera: Camera, frame: Frame, *, stride: int = 1) -> int:
         """Learn from the picture of a cut; return how many nodes that were hidden are seen now.

@@ -2,9 +2,9 @@
 
 Samples with a spacing of r (one per area r^2, placed at random) leave the share `exp(-area / r^2)` of the surface
 uncovered by splats of that area. LPC 4 draws squares of side r: 37% holes, hidden there by a projection that is
-larger than need be. Splats here have an area of `CLOSING^2 r^2`: 0.5%, in gaps hardly wider than a splat, which are
-closed in the picture (`HOLE`). What remains is 0.02% of a closed surface, and silhouettes grow by a third of the
-spacing.
+larger than need be. Splats here have an area of `CLOSING^2 r^2`: 0.3%, in gaps hardly wider than a splat, which are
+closed in the picture (`HOLE`). What remains is 0.01% of a closed surface, less than 0.05% at any moment of a stream,
+and silhouettes grow by a seventh of the spacing, hardly anywhere by half of it (`benchmarks/moments.py`).
 
 A splat is one pixel where it is no larger. A larger one is a disc: in the tangent plane of its sample where there is a
 normal or its neighbours make one (`render.planes`), which keeps silhouettes thin and depths right; else facing the
@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 
-CLOSING = 2.3
+CLOSING = 2.4
 """Side of a square splat over the spacing of its samples; round splats have the same area."""
 
 ROUND = 2.0 / math.sqrt(math.pi)

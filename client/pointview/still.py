@@ -12,6 +12,7 @@ from pointstream.stores import open_store
 
 from .budget import allowance, refine_within
 from .camera import Camera
+from .occlusion import Occlusion
 from .refine import Cut, refine
 from .render import Backend, Frame, Kind, Style, antialias, open_backend
 from .settle import settle
@@ -109,7 +110,8 @@ async def draw_still(
     try:
         backend = open_backend(options.backend, layer.header, threads=options.threads)
         try:
-            look, cut = await _settle(layer, options, backend, progress)
+            occlusion = Occlusion(layer.header.nodes, kept=1)
+            look, cut = await _settle(layer, options, backend, occlusion, progress)
             camera = camera_of(layer, options)
             draw = partial(antialias.draw, backend, cut, layer.take, camera, options.style, finer=options.antialias)
             draw()  # uploads, and compiles at the first use
@@ -127,6 +129,7 @@ async def draw_still(
             "culled": asdict(cut.culled),
             "frame_ms": round(frame_ms, 3),
             "bytes_read": layer.stats.bytes_received,
+            "left_out": occlusion.left_out,
         }
         problems = tuple(f"{error.text} ({error.count} times)" for error in layer.stats.errors)
         return Still(frame=frame, cut=cut, report=report, problems=problems)
@@ -142,7 +145,11 @@ def camera_of(layer: AccessLayer, options: StillOptions) -> Camera:
 
 
 async def _settle(
-    layer: AccessLayer, options: StillOptions, backend: Backend, progress: Callable[[Cut], None] | None
+    layer: AccessLayer,
+    options: StillOptions,
+    backend: Backend,
+    occlusion: Occlusion,
+    progress: Callable[[Cut], None] | None,
 ) -> tuple[Callable[[AccessLayer], Cut], Cut]:
     """Fetch the view; return how to look at it again, and what it shows."""
     wait = partial(settle, clock=time.monotonic, patience=options.patience, progress=progress)
@@ -153,11 +160,15 @@ async def _settle(
     def coarser(layer: AccessLayer, factor: float, hidden: NDArray[np.bool_] | None) -> Cut:
         return cut_of(layer, replace(options, tolerance=options.tolerance * factor), hidden)
 
+    looking = options.style
+    if looking.splat == "blended":
+        looking = replace(looking, splat="disc")  # which shows the same nodes, sooner
+
     def draw(cut: Cut) -> tuple[Camera, Frame]:
         camera = camera_of(layer, options)
-        return camera, backend.draw(cut, layer.take, camera, options.style)
+        return camera, backend.draw(cut, layer.take, camera, looking)
 
-    return await unveil(layer, coarser, wait, draw)
+    return await unveil(layer, occlusion, coarser, wait, draw)
 
 
 def cut_of(layer: AccessLayer, options: StillOptions, hidden: NDArray[np.bool_] | None = None) -> Cut:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
-from .occlusion import Occlusion
-
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
@@ -16,6 +14,7 @@ if TYPE_CHECKING:
     from pointstream.layer import AccessLayer
 
     from .camera import Camera
+    from .occlusion import Occlusion
     from .refine import Cut
     from .render import Frame
 
@@ -31,6 +30,7 @@ MOST_PASSES = 4
 
 async def unveil(
     layer: AccessLayer,
+    occlusion: Occlusion,
     cut_of: Callable[[AccessLayer, float, Hidden], Cut],
     settle: Callable[[AccessLayer, Look], Awaitable[Cut]],
     draw: Callable[[Cut], tuple[Camera, Frame]],
@@ -39,6 +39,8 @@ async def unveil(
 
     Parameters
     ----------
+    occlusion : Occlusion
+        Of this view; afterwards its verdict says whether anything was left out.
     cut_of : callable
         Cut of what is here, at so many times the tolerance, without hidden nodes.
     settle : callable
@@ -46,7 +48,6 @@ async def unveil(
     draw : callable
         Draws a cut.
     """
-    occlusion = Occlusion(layer.header.nodes, kept=1)
     for factor in COARSER + MOST_PASSES * (1.0,):
         hidden = occlusion.hidden if len(occlusion.hidden) == layer.header.nodes else None
         look = partial(_look, cut_of=cut_of, factor=factor, hidden=hidden)

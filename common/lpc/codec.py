@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import threading
+from collections.abc import Callable
 from functools import cache
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal, Protocol
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
 
 Effort = Literal["default", "best", "fast"]
 Engine = Literal["auto", "numpy", "compiled"]
+Known = Callable[[int, "Sequence[Cloud]"], bytes | None]
 
 
 WINDOWS: dict[Effort, int] = {"default": 64, "best": 64, "fast": 16}
@@ -180,6 +182,7 @@ def encode_clouds(
     *,
     parent: NDArray[np.int64] | None = None,
     first: int = 0,
+    known: Known | None = None,
     effort: Effort = "default",
     engine: Engine = "auto",
 ) -> list[bytes]:
@@ -193,24 +196,43 @@ def encode_clouds(
         Number of each cloud's parent among these, always a smaller one; -1 for none.
     first : int
         Clouds before it are only there as context: their frames are left out.
+    known : callable, optional
+        ``known(i, context)`` gives the frame of cloud `i` if it is known without encoding, else None.
     """
     writer = _Writer(lattice, codes, bounds, schema, effort, engine)
     above = [-1] * (len(bounds) - 1) if parent is None else parent.tolist()
     inner = set(above)
-    known: dict[int, Cloud] = {}
+    clouds: dict[int, Cloud] = {}
     frames = []
     for number, (begin, end) in enumerate(itertools.pairwise(np.asarray(bounds).tolist())):
-        placed = writer.place(begin, end)
-        if number in inner:
-            known[number] = writer.known(placed)
-        if number >= first:
-            line: list[Cloud] = []
-            up = above[number]
-            while up >= 0 and len(line) < ANCESTORS:
-                line.append(known[up])
-                up = above[up]
-            frames.append(writer.frame(placed, line[::-1]))
+        line: list[Cloud] = []
+        up = above[number]
+        while up >= 0 and len(line) < ANCESTORS and number >= first:
+            line.append(clouds[up])
+            up = above[up]
+        context = line[::-1]
+        frame = known(number, context) if known and number >= first else None
+        if frame is None or number in inner:
+            placed = writer.place(begin, end)
+            if number in inner:
+                clouds[number] = writer.known(placed)
+            if number >= first and frame is None:
+                frame = writer.frame(placed, context)
+        if frame is not None:
+            frames.append(frame)
     return frames
+
+
+def near_box(clouds: Sequence[Cloud], schema: Schema, low: NDArray[np.int64], high: NDArray[np.int64]) -> Near | None:
+    """Give the samples that ancestors have in a box of the lattice, faces included.
+
+    They tell the context of a cloud of that box, but for one that keeps low bits apart: of so large boxes, None.
+    """
+    x, y, z = low.tolist()
+    if (high - low).max() >= 1 << TOP_BITS:
+        return None
+    box = np.stack([low - low, high - low]).astype(np.uint16)
+    return select(clouds, schema, corner=(x, y, z), shift=0, position=box, inside=_codec("auto").inside)
 
 
 class _Writer:
@@ -371,14 +393,18 @@ def cloud_to_points(cloud: Cloud, header: Header) -> PointBatch:
     PointBatch
         Every attribute of the header, constants included.
     """
-    xyz = dequantise(cloud.lattice(), np.asarray(header.origin, np.float64), header.step)
+    return samples_to_points(cloud.lattice(), cloud.codes, header)
+
+
+def samples_to_points(lattice: NDArray[np.int64], codes: Mapping[str, NDArray[Any]], header: Header) -> PointBatch:
+    """Give samples, of one or many clouds, in model units; see `cloud_to_points`."""
+    xyz = dequantise(lattice, np.asarray(header.origin, np.float64), header.step)
     values: dict[str, NDArray[Any]] = {}
     for attribute in header.attributes:
-        codes = cloud.codes[attribute.name]
         if attribute.kind == "normal":
-            values[attribute.name] = decode_normals(codes, attribute.bits)
+            values[attribute.name] = decode_normals(codes[attribute.name], attribute.bits)
         else:
-            values[attribute.name] = attribute.decode(codes)
+            values[attribute.name] = attribute.decode(codes[attribute.name])
     for name, constant in header.constants.items():
-        values[name] = constant.fill(len(cloud))
+        values[name] = constant.fill(len(lattice))
     return PointBatch(xyz, values)

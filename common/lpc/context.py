@@ -7,7 +7,7 @@ of each: better company than the samples before it in its own order.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,6 +28,31 @@ if TYPE_CHECKING:
 
 ANCESTORS = 4
 """Of those further up hardly any sample is near."""
+
+
+def has_context(schema: Schema) -> bool:
+    """Whether clouds are told from their ancestors: normals and colours are."""
+    return any(attribute.kind != "scalar" for attribute in schema)
+
+
+def with_ancestors(nodes: NDArray[np.int64], parent: NDArray[Any], generations: int) -> NDArray[np.int64]:
+    """Give nodes and their nearest ancestors, each once, parents first.
+
+    Parameters
+    ----------
+    nodes : ndarray, (k,) int64
+    parent : ndarray, (n,) of integers
+        -1 for the root.
+    generations : int
+        How many ancestors of each.
+    """
+    found, line = [nodes], nodes
+    while generations and len(line):
+        line = np.unique(parent[line])
+        line = line[line >= 0].astype(np.int64)
+        found.append(line)
+        generations -= 1
+    return np.unique(np.concatenate(found))
 
 
 @dataclass(frozen=True, slots=True)

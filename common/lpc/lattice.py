@@ -28,6 +28,9 @@ The bound is of what a reader decodes, in float64. A renderer that places splats
 
 EPSILON = 2.0**-52
 
+MOST_STEPS = 2.0**50
+"""From 0 to any coordinate: further, a lattice point is not told from its neighbours in float64."""
+
 
 def position_step(spacing: float, extent: float, position_error: float | None = None) -> float:
     """Edge of a lattice cell.
@@ -68,10 +71,17 @@ def position_step(spacing: float, extent: float, position_error: float | None = 
 
 
 def quantise(xyz: NDArray[np.float64], origin: NDArray[np.float64], step: float) -> NDArray[np.int64]:
-    """Nearest lattice points of (n, 3) positions; float64 throughout."""
-    scaled = xyz - origin
+    """Nearest lattice points of (n, 3) positions; float64 throughout.
+
+    An origin that is a multiple of the step, as the builder's are, does not enter the rounding: a position half way
+    between two points goes to the same one whatever the origin.
+    """
+    start = np.rint(origin / step)
+    whole = (start * step == origin) & (np.abs(start) < 2 * EPSILON**-1)
+    scaled = xyz - np.where(whole, 0.0, origin)
     scaled /= step
     np.rint(scaled, out=scaled)
+    scaled -= np.where(whole, start, 0.0)
     return scaled.astype(np.int64)
 
 
@@ -85,11 +95,11 @@ def dequantise(lattice: NDArray[np.int64], origin: NDArray[np.float64], step: fl
 def position_error_bound(step: float, origin: NDArray[np.float64], extent: float) -> float:
     """No position moves further than this in `quantise` and `dequantise`.
 
-    Half a cell's diagonal and the rounding of float64: per axis, 2**-53 of the extent in each of subtraction,
-    division and product and 2**-53 of the coordinate in the sum, all taken twice.
+    Half a cell's diagonal and the rounding of float64: per axis, 2**-53 of the coordinate in each of division, origin
+    and sum and 2**-53 of the extent in the product, all taken twice.
     """
     far = float(np.abs(origin).max()) + extent
-    return math.sqrt(3.0) * (step / 2.0 + EPSILON * (3.0 * extent + far))
+    return math.sqrt(3.0) * (step / 2.0 + EPSILON * (extent + 3.0 * far))
 
 
 def paper_bits(extent: float, spacing: float) -> int:

@@ -8,6 +8,9 @@ Two kinds of regions have no area to speak of. Along a straight line the eight n
 spacing is a quarter of the distance. A model of fewer than `FEWEST` samples has the smallest distance of any two: half
 of it, the position error, then keeps them apart.
 
+Lattice points that several samples share count once when distances are measured, and the surface is that of the points:
+where samples are denser than the lattice, it is what a reader can see of them.
+
 Surface adds up: an inner cell has the area of its halves. A cell of few samples takes the density of its sibling.
 """
 
@@ -64,7 +67,7 @@ class Areas:
     low, high : ndarray, (n,) int64
         Samples of the cell, a range in the order of paths.
     area : ndarray, (n,) float64
-        Model units squared; nan for a lone cell with too few samples.
+        Nan for a lone cell with too few samples.
     region : ndarray, (n,) bool
     spacing : ndarray, (n,) float64
         Of measured regions; nan elsewhere.
@@ -99,7 +102,7 @@ def measure(
     fixed : ndarray, (n, 3) uint64
         Coordinates in the order of paths.
     xyz : ndarray, (n, 3) float64
-        The same samples in model units.
+        The same samples; areas are in their unit, squared.
     priority : ndarray, (n,) uint64
         The smallest of a region make the queries.
     depth : int
@@ -141,6 +144,20 @@ def pile_spacing(
     low, high = np.zeros(1, np.int64), np.array([len(xyz)])
     _probe(xyz, priority, low, high, face[None], probing.queries, low, spacing)
     return float(spacing[0]) * math.sqrt(len(xyz) / samples)
+
+
+def probe(
+    xyz: NDArray[np.float64],
+    priority: NDArray[np.uint64],
+    low: NDArray[np.int64],
+    high: NDArray[np.int64],
+    faces: NDArray[np.float64],
+    probing: Probing,
+) -> NDArray[np.float64]:
+    """Spacing of cells given by their ranges and faces; see `measure`."""
+    spacing = np.empty(len(low))
+    _probe(xyz, priority, low, high, faces, probing.queries, np.arange(len(low)), spacing)
+    return spacing
 
 
 @njit(cache=True, nogil=True)
@@ -187,11 +204,11 @@ def _probe(xyz: Any, priority: Any, lows: Any, highs: Any, faces: Any, queries: 
     inside = np.empty(queries, np.bool_)
     for r in range(len(lows)):
         low, high = lows[r], highs[r]
-        x, y, z = xyz[low:high, 0].copy(), xyz[low:high, 1].copy(), xyz[low:high, 2].copy()
+        point, x, y, z = _points(xyz, low, high)
         if high - low < FEWEST:
             spacing[cell[r]] = _smallest_distance(x, y, z)
             continue
-        squared = np.empty(high - low)
+        squared = np.empty(len(x))
         count = 0
         for i in range(low, high):  # the samples of smallest priority
             if count < queries or priority[i] < best[count - 1]:
@@ -199,7 +216,7 @@ def _probe(xyz: Any, priority: Any, lows: Any, highs: Any, faces: Any, queries: 
                 while at > 0 and best[at - 1] > priority[i]:
                     best[at], chosen[at] = best[at - 1], chosen[at - 1]
                     at -= 1
-                best[at], chosen[at] = priority[i], i - low
+                best[at], chosen[at] = priority[i], point[i - low]
                 count = min(count + 1, queries)
         within = 0
         for q in range(count):
@@ -234,7 +251,22 @@ def _probe(xyz: Any, priority: Any, lows: Any, highs: Any, faces: Any, queries: 
         ordered = np.sort(distance[:count])
         across = (ordered[(count - 1) // 2] + ordered[count // 2]) / 2.0
         along = across * 2.0 / np.sqrt(np.pi * 8)
-        spacing[cell[r]] = along if _width(x, y, z) < STRAIGHT * along else across
+        apart = along if _width(x, y, z) < STRAIGHT * along else across
+        spacing[cell[r]] = apart * np.sqrt(len(x) / (high - low))
+
+
+@njit(cache=True, nogil=True)
+def _points(xyz: Any, low: int, high: int) -> Any:
+    """Different places among the samples of a range, and which of them each sample is at."""
+    point = np.empty(high - low, np.int64)
+    x, y, z = np.empty(high - low), np.empty(high - low), np.empty(high - low)
+    count = 0
+    for i in range(low, high):  # equal paths are neighbours
+        if i == low or xyz[i, 0] != x[count - 1] or xyz[i, 1] != y[count - 1] or xyz[i, 2] != z[count - 1]:
+            x[count], y[count], z[count] = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+            count += 1
+        point[i - low] = count - 1
+    return point, x[:count], y[:count], z[:count]
 
 
 @njit(cache=True, nogil=True)

@@ -11,6 +11,7 @@ from numba import njit
 from lpc.octahedral_compiled import unit_vectors
 
 from .areas import Probing, measure
+from .priority import defer_copies
 from .rows import as_words, positions
 from .spool import write_all
 from .tree import Tree, grow
@@ -110,7 +111,7 @@ def partition(
     first_row: int,
     bucket: Bucket,
     above: list[int],
-    thresholds: list[int],
+    shares: list[int],
     *,
     cells: Cells,
     probing: Probing,
@@ -124,8 +125,8 @@ def partition(
     ----------
     first_row, bucket
         Which rows.
-    above, thresholds : list of int
-        Upper nodes from the root to the bucket, and up to which priority each takes samples.
+    above, shares : list of int
+        Upper nodes from the root to the bucket, and how many samples each takes.
     cells, probing, cloud_size
         How to divide and measure.
     regions : Rows
@@ -139,14 +140,14 @@ def partition(
     xyz = positions(rows)
     fixed = cells.fixed(xyz)
     priority = np.ascontiguousarray(rows["priority"])
+    defer_copies(fixed, priority)
     areas = measure(cells, probing, fixed, xyz, priority, bucket.depth)
     del xyz
-    tree, owner = grow(cells, fixed, priority, scratch, bucket.depth, thresholds[-1] if above else -1, cloud_size)
+    taken, floor = _smallest(priority, sum(shares))
+    tree, owner = grow(cells, fixed, priority, scratch, bucket.depth, taken, floor, cloud_size)
     del fixed
-    limits = np.array(thresholds, np.uint64)
-    taken = np.flatnonzero(owner < 0)
     group = owner + np.int32(len(above))
-    group[taken] = np.searchsorted(limits, priority[taken])
+    group[taken] = np.repeat(np.arange(len(above), dtype=np.int32), shares)
     counts = np.bincount(group, minlength=len(above) + len(tree))
     ends = np.cumsum(counts)
     order = np.empty(len(rows), np.int32)
@@ -170,6 +171,15 @@ def partition(
         spacing=areas.spacing[measured],
         weight=(areas.high - areas.low)[measured],
     )
+
+
+def _smallest(priority: NDArray[np.uint64], count: int) -> tuple[NDArray[np.int64], np.uint64]:
+    """Find the samples of smallest priority, in its order, and the largest of theirs."""
+    if not count:
+        return np.empty(0, np.int64), np.uint64(0)
+    limit = np.partition(priority, count - 1)[count - 1]
+    found = np.flatnonzero(priority <= limit)
+    return found[np.argsort(priority[found], kind="stable")][:count], limit
 
 
 def sort_by_path(rows: NDArray[Any], cells: Cells, bucket: Bucket) -> tuple[NDArray[Any], NDArray[np.uint64]]:

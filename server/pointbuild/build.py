@@ -15,7 +15,7 @@ the bytes. Each keeps a journal of what it has done, from which a build that was
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import asdict, astuple, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,7 +29,10 @@ from .arrays import ArrayScan
 from .cells import Cells
 from .divide import divide
 from .encode import kernels_are_loaded
-from .folder import Folder, manifest_of, work_folder
+from .estimate import Sketch, estimate_spacing
+from .extend import OldModel
+from .folder import Folder, manifest_of, was_written, work_folder
+from .frame import Frame, choose_step
 from .inputs import Inputs, Source, expand, open_inputs
 from .journal import as_array, from_array
 from .options import BuildOptions
@@ -62,11 +65,14 @@ class BuildReport:
         Wall time.
     peak_rss_bytes : int
         Peak resident size of the process so far.
+    clouds_kept : int
+        Of an older model, as they were.
     """
 
     header: Header
     seconds: float
     peak_rss_bytes: int
+    clouds_kept: int = 0
 
     @property
     def samples_per_second(self) -> float:
@@ -83,6 +89,7 @@ def build_model(
     clock: Callable[[], float],
     tell: Callable[[str], None] = lambda _: None,
     cluster: Cluster | None = None,
+    append: Path | None = None,
 ) -> BuildReport:
     """Build one model of some scans.
 
@@ -100,6 +107,9 @@ def build_model(
         Gets a sentence where a build that was killed left files, and where the scans differ.
     cluster : Cluster, optional
         Workers that sort and encode; without them threads do.
+    append : Path, optional
+        A model that the scans are added to, which may be `out`. It determines the lattice and all options but those
+        of memory, threads, places and the normals of the scans.
 
     Raises
     ------
@@ -113,14 +123,27 @@ def build_model(
     disk.check_target(out)
     progress = progress or Silent()
     sources = expand(sources)
-    manifest = manifest_of(sources, options, GENERATOR)
-    if manifest and cluster:
-        manifest["cluster"] = cluster.url
-    with disk.translated(out), work_folder(options.scratch or out.parent, out, manifest, tell) as folder:
+    old = None if append is None else OldModel.open(append)
+    if old:
+        options = old.options(options)
+    manifest = manifest_of(sources if old is None else [old.path, *sources], options, GENERATOR)
+    if manifest:
+        manifest |= {"cluster": cluster and cluster.url, "append": append is not None}
+    place = options.scratch or out.parent
+    if old and manifest and was_written(place, out, manifest, old.header.digest):
+        tell(f"the scans were added to {out} before the build was stopped: there is nothing left to do")
+        with work_folder(place, out, None, lambda _: None):
+            pass
+        kept = old.header.nodes
+        return BuildReport(
+            header=old.header, seconds=clock() - began, peak_rss_bytes=memory.peak_bytes(), clouds_kept=kept
+        )
+    with disk.translated(out), work_folder(place, out, manifest, tell) as folder:
         if not kernels_are_loaded():
             _warm(folder)
-        header = _build(sources, out, folder, options, progress, cluster, tell)
-    return BuildReport(header=header, seconds=clock() - began, peak_rss_bytes=memory.peak_bytes())
+        header, kept = _build(sources, out, folder, options, progress, cluster, tell, old)
+    seconds = clock() - began
+    return BuildReport(header=header, seconds=seconds, peak_rss_bytes=memory.peak_bytes(), clouds_kept=kept)
 
 
 def _warm(folder: Folder) -> None:
@@ -143,7 +166,8 @@ def _build(
     progress: Progress,
     cluster: Cluster | None = None,
     tell: Callable[[str], None] = lambda _: None,
-) -> Header:
+    old: OldModel | None = None,
+) -> tuple[Header, int]:
     """Go through the stages; what the folder's journals know is not done again."""
     journal = folder.journal("survey")
     recalled = next(iter(journal), None)
@@ -152,32 +176,40 @@ def _build(
         inputs = open_inputs(sources, options, partial(_estimate, scratch=folder.path, options=options))
         for note in inputs.notes:
             tell(note)
-        sizes, blocks = _sizes(inputs, out, folder, options), None
+        if old:
+            inputs = old.join(inputs)
+        sizes, blocks = _sizes(inputs, out, folder, options, owned=old is not None), None
     else:
         told = from_array(recalled[0])
         inputs, sizes = Inputs.from_json(told["inputs"]), memory.Sizes(**told["sizes"])
         blocks = [Block(*block) for block in recalled[1].tolist()]
+    columns = columns_of(inputs.attributes, options.precision, owned=old is not None)
     # The crew comes last and goes first: no thread may hold a file that is closed.
     with (
-        closing(Spool(folder.path / "spool", columns_of(inputs.attributes, options.precision), blocks)) as spool,
+        closing(Spool(folder.path / "spool", columns, blocks)) as spool,
         closing(Regions(folder.path / "rows")) as regions,
         cluster.crew(sizes.threads, folder) if cluster else Crew(sizes.threads) as crew,
     ):
         progress.stage("read", spool.samples or inputs.samples_hint)
         if recalled is None:
-            found = survey(inputs.batches(sizes.block), spool, crew, progress, options.precision)
+            sketched = options.position_error is None and options.step is None
+            found = survey(inputs.batches(sizes.block), spool, crew, progress, options.precision, sketched=sketched)
+            if old:
+                found = old.join_survey(found)
             told = {"inputs": inputs.to_json(), "sizes": asdict(sizes), "found": found.to_json()}
-            journal.add(as_array(told), np.array([astuple(block) for block in spool.blocks], np.int64))
+            placed = np.array([astuple(block) for block in spool.blocks], np.int64)
+            journal.add(as_array(told), placed, *found.sketch.arrays())
             folder.remove("normals-*")
         else:
-            found = Survey.from_json(told["found"])
+            found = replace(Survey.from_json(told["found"]), sketch=Sketch.from_arrays(recalled[2:]))
             progress.advance(spool.samples)
+        frame = _frame(found, spool, options, folder, crew, progress)
         division = divide(
             spool,
-            Cells.over(found.low, found.high),
+            frame,
             regions,
             found.schema,
-            single=found.single,
+            owned=old is not None,
             cloud_size=options.cloud_size,
             seed=options.seed,
             bucket_samples=sizes.bucket,
@@ -185,7 +217,28 @@ def _build(
             crew=crew,
             progress=progress,
         )
-        return publish(division, found, inputs, options, folder=folder, out=out, crew=crew, progress=progress)
+        # Workers of a cluster may not reach the model.
+        clouds = None if old is None or cluster else old.clouds(found, frame, options, GENERATOR)
+        return publish(
+            division, found, frame, inputs, options,
+            folder=folder, out=out, crew=crew, progress=progress, old=clouds,
+        )  # fmt: skip
+
+
+def _frame(found: Survey, spool: Spool, options: BuildOptions, folder: Folder, crew: Crew, progress: Progress) -> Frame:
+    """Choose the lattice."""
+    cells = Cells.over(found.low, found.high)  # in model units
+    journal = folder.journal("frame")
+    recalled = next(iter(journal), None)
+    if recalled is not None:
+        step, spacing = recalled[0].tolist()
+    else:
+        spacing = 0.0
+        if options.position_error is None and options.step is None:
+            spacing = estimate_spacing(spool, cells, found.sketch, options.cloud_size, crew, progress)
+        step = options.step or choose_step(spacing, found.low, found.high, options.position_error)
+        journal.add(np.array([step, spacing]))
+    return replace(Frame.over(found.low, found.high, step), spacing=spacing)
 
 
 def _estimate(scan: Scan, *, scratch: Path, options: BuildOptions) -> Scan:
@@ -194,14 +247,15 @@ def _estimate(scan: Scan, *, scratch: Path, options: BuildOptions) -> Scan:
     return normals.estimate(scan, scratch, options.memory_bytes)
 
 
-def _sizes(inputs: Inputs, out: Path, folder: Folder, options: BuildOptions) -> memory.Sizes:
+def _sizes(inputs: Inputs, out: Path, folder: Folder, options: BuildOptions, *, owned: bool) -> memory.Sizes:
     """Check the disk, and share out the memory."""
-    spool_bytes = sum(column.itemsize for column in columns_of(inputs.attributes, options.precision))
+    spool_bytes = sum(column.itemsize for column in columns_of(inputs.attributes, options.precision, owned=owned))
     attribute_bytes = spool_bytes - 24  # codes are never wider than values
+    attribute_bytes += 4 if owned else 0  # of a row: the old cloud has a word of its own
     samples = inputs.samples_at_most
-    row_bytes = whole_words(row_start(single=False) + attribute_bytes)
+    row_bytes = whole_words(row_start(short=False) + attribute_bytes)
     sizes = memory.choose_sizes(options, samples, row_bytes, memory.resident_bytes())
-    stored = whole_words(row_start(single=inputs.single) + attribute_bytes)
+    stored = whole_words(row_start(short=True) + attribute_bytes)  # more only where an outlier is
     disk.check_space(
         disk.predict(samples, stored, attribute_bytes, (sizes.threads + 2) * sizes.bucket),
         folder.path,

@@ -50,7 +50,7 @@ class Cells:
     Parameters
     ----------
     low, extent : ndarray, (3,) float64
-        Corner and sides of the bounding box of all samples, model units.
+        Corner and sides of the root box.
     axes, shifts : ndarray, (depths,) uint8
         For each depth the axis that is halved there, and which bit of its fixed point coordinate tells the half.
     """
@@ -96,7 +96,7 @@ class Cells:
         return len(self.axes)
 
     def fixed(self, xyz: NDArray[np.float64]) -> NDArray[np.uint64]:
-        """48-bit coordinates (n, 3) of positions (n, 3); the box's upper faces belong to the last cell."""
+        """48-bit coordinates (n, 3) of positions (n, 3); what is on or beyond the box is in its last cell."""
         out = np.empty(xyz.shape, np.uint64)
         _fix_all(xyz, self.low, self.extent, out)
         return out
@@ -158,7 +158,7 @@ def _fix(value: float, low: float, extent: float) -> Any:
     # A quotient, not a product with 1 / extent: halves, quarters, ... of the extent must come out exact.
     if extent == 0.0:
         return np.uint64(0)
-    return min(np.uint64(np.int64((value - low) / extent * 281474976710656.0)), np.uint64(281474976710655))
+    return min(np.uint64(np.int64(max(value - low, 0.0) / extent * 281474976710656.0)), np.uint64(281474976710655))
 
 
 @njit(cache=True, nogil=True)

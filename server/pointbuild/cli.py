@@ -18,6 +18,7 @@ from lpc.errors import LpcError
 from lpc.info import info_dict
 
 from .build import BuildReport, build_model
+from .extend import read_header
 from .options import BuildOptions
 from .progress import Bar, Lines, Silent
 from .readers.detect import SUFFIXES
@@ -31,16 +32,23 @@ if TYPE_CHECKING:
     from .cluster import Cluster
 
 
+MODELS_OWN = ("cloud_size", "position_error", "seed", "normal_bits", "color_bits", "attributes", "effort")
+"""Options that a model has settled for all scans that are added to it."""
+
+
 @click.command()
 @click.argument("scans", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="SCAN...")
-@click.option("-o", "--output", "out", required=True, type=click.Path(path_type=Path), metavar="MODEL.lpc")
+@click.option("-o", "--output", "out", type=click.Path(path_type=Path), metavar="MODEL.lpc",
+              help="Needed unless scans are added to a model.")  # fmt: skip
+@click.option("--append", default=None, type=click.Path(path_type=Path), metavar="MODEL.lpc",
+              help="Add the scans to this model.")  # fmt: skip
 @click.option("--cloud-size", default=2048, show_default=True, type=click.IntRange(1, 65535), help="Samples a cloud.")
 @click.option("--memory", default="2G", show_default=True, help="Ceiling on resident memory.")
 @click.option(
     "--threads", default=0, type=click.IntRange(0, 1024), help="Worker threads; default: as many as there are cores."
 )
-@click.option("--position-error", default="auto", show_default=True, metavar="auto|LENGTH",
-              help="How far a sample may move; auto: half the spacing.")  # fmt: skip
+@click.option("--position-error", default="auto", show_default=True, metavar="auto|LENGTH|MODEL.lpc",
+              help="How far a sample may move; auto: half the spacing; a model: on its lattice.")  # fmt: skip
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(-(2**63), 2**64 - 1),
               help="Of the hash that picks each cloud's samples.")  # fmt: skip
 @click.option("--normals", default="auto", show_default=True, type=click.Choice(["auto", "keep", "estimate", "drop"]),
@@ -58,9 +66,13 @@ if TYPE_CHECKING:
 @click.option("--share", default=None, metavar="URL",
               help="What all workers reach, a folder or s3://...; default: that of --scratch.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+@click.pass_context
 def build(
+    context: click.Context,
+    /,
     scans: tuple[Path, ...],
-    out: Path,
+    out: Path | None,
+    append: Path | None,
     memory: str,
     position_error: str,
     attributes: str | None,
@@ -70,9 +82,12 @@ def build(
     **options: Any,
 ) -> None:
     """Turn scans (PLY, LAS, LAZ, E57, PCD, OBJ, NPZ, text), or directories of them, into one model."""
+    out = _target(context, out, append)
+    error, step = _lattice(position_error)
     chosen = BuildOptions(
         memory_bytes=_size(memory),
-        position_error=_length(position_error),
+        position_error=error,
+        step=step,
         attributes=None
         if attributes is None
         else tuple(name.strip() for name in attributes.split(",") if name.strip()),
@@ -83,11 +98,15 @@ def build(
     if share is not None and dask is None:
         raise click.BadParameter("only a build on a cluster (--dask) shares files", param_hint="--share")
     with _stopped_by_signals(), _progress(as_json) as progress, _cluster(dask, share) as cluster:
-        report = build_model(scans, out, chosen, progress, clock=time.monotonic, tell=_tell, cluster=cluster)
+        report = build_model(
+            scans, out, chosen, progress, clock=time.monotonic, tell=_tell, cluster=cluster, append=append
+        )
     if as_json:
-        click.echo(json.dumps(report_dict(report)))
+        kept = report.clouds_kept
+        added = {} if append is None else {"clouds_kept": kept, "clouds_written": report.header.nodes - kept}
+        click.echo(json.dumps(report_dict(report) | added))
     else:
-        click.echo(_sentence(report, out))
+        click.echo(_sentence(report, out) + (f"; {report.clouds_kept:,} clouds kept" if append else ""))
 
 
 def _tell(text: str) -> None:
@@ -121,16 +140,34 @@ def _size(text: str) -> int:
         raise click.BadParameter(str(error), param_hint="--memory") from error
 
 
-def _length(text: str) -> float | None:
+def _target(context: click.Context, out: Path | None, append: Path | None) -> Path:
+    """Where the model goes: over the one that is added to, if nothing else is said."""
+    if append is None:
+        if out is None:
+            raise click.UsageError("say where the model goes: -o MODEL.lpc")
+        return out
+    for name in MODELS_OWN:
+        if context.get_parameter_source(name) != click.core.ParameterSource.DEFAULT:
+            option = name.replace("_", "-").replace("color", "colour")
+            raise click.UsageError(f"--{option} is settled by the model that --append names: leave it out")
+    return append if out is None else out
+
+
+def _lattice(text: str) -> tuple[float | None, float | None]:
+    """Position error, or step of the lattice of a model."""
     if text == "auto":
-        return None
+        return None, None
+    if text.endswith(".lpc"):
+        return None, read_header(Path(text)).step
     try:
         length = float(text)
     except ValueError:
         length = math.nan
     if not (math.isfinite(length) and length > 0):
-        raise click.BadParameter(f"{text!r} is neither auto nor a length above 0", param_hint="--position-error")
-    return length
+        raise click.BadParameter(
+            f"{text!r} is neither auto, a length above 0 nor a model (.lpc)", param_hint="--position-error"
+        )
+    return length, None
 
 
 def _cluster(address: str | None, url: str | None) -> AbstractContextManager[Cluster | None]:

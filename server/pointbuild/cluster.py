@@ -87,7 +87,11 @@ class ClusterCrew(Crew):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         super().__exit__(kind, error, trace)
-        self._share.clear()
+        try:
+            self._share.clear()
+        except BuildError:
+            if error is None:  # what went wrong before says more
+                raise
 
     def share(self, regions: Regions, folder: Folder) -> SharedRegions:
         """Move the scattered rows to the share."""

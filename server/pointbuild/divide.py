@@ -16,7 +16,7 @@ from .plan import Plan, make_plan
 from .rows import row_dtype
 from .scatter import Candidates, Regions, Scattered, gather, scatter
 from .spacing import model_spacing
-from .upper import Upper, candidate_limits, thresholds
+from .upper import Upper, candidate_limits, share_out
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from .cells import Cells
     from .folder import Folder
+    from .frame import Frame
     from .progress import Progress
     from .rows import Rows
     from .spool import Block, Spool
@@ -41,7 +42,7 @@ GATHERED = 1 << 16
 
 @dataclass(frozen=True, slots=True)
 class Division:
-    """The tree, r of the whole model (model units), and the rows sorted by node."""
+    """The tree, r of the whole model, both in lattice steps, and the rows sorted by node."""
 
     nodes: Nodes
     spacing: float
@@ -50,11 +51,11 @@ class Division:
 
 def divide(
     spool: Spool,
-    cells: Cells,
+    frame: Frame,
     regions: Regions,
     schema: Schema,
     *,
-    single: bool,
+    owned: bool,
     cloud_size: int,
     seed: int,
     bucket_samples: int,
@@ -67,14 +68,14 @@ def divide(
 
     Parameters
     ----------
-    spool, cells
-        The samples, which are used up, and how their box is divided.
+    spool, frame
+        The samples, which are used up, and their lattice.
     regions : Regions
         Gets the rows.
     schema : Schema
         The attributes that rows carry.
-    single : bool
-        Positions are float32 without loss.
+    owned : bool
+        Samples say which cloud of an older model they were in.
     cloud_size, seed : int
         M, and what the priorities hash.
     bucket_samples : int
@@ -86,17 +87,17 @@ def divide(
     slack : float
         See `SLACK`.
     """
-    probing = Probing.of(spool.samples, cloud_size)
+    probing, cells = Probing.of(spool.samples, cloud_size), frame.cells
     most = max(bucket_samples, probing.region)
-    plan = _count(spool, cells, most, folder, crew, progress)
+    plan = _count(spool, frame, cells, most, folder, crew, progress)
     check_piles(plan.buckets)
-    regions.lay_out(row_dtype(schema, single=single), [bucket.count for bucket in plan.buckets])
+    regions.lay_out(row_dtype(schema, short=frame.short, owned=owned), [bucket.count for bucket in plan.buckets])
     regions.restore()
     limits = candidate_limits(plan, cloud_size, slack)
-    candidates = _scatter(spool, cells, plan, limits, seed, schema, regions, folder, crew, progress)
+    candidates = _scatter(spool, frame, plan, limits, seed, schema, regions, folder, crew, progress)
     gathered = folder.journal("gather")
     known = iter(gathered)
-    while (upper := thresholds(plan, candidates, limits, cloud_size)) is None:
+    while (upper := share_out(plan, candidates, limits, cloud_size)) is None:
         slack *= 4
         limits = candidate_limits(plan, cloud_size, slack)
         recalled = next(known, None)
@@ -111,12 +112,12 @@ def divide(
     return Division(assemble(plan, upper, trees), spacing, rows.replaced())
 
 
-def _count(spool: Spool, cells: Cells, most: int, folder: Folder, crew: Crew, progress: Progress) -> Plan:
+def _count(spool: Spool, frame: Frame, cells: Cells, most: int, folder: Folder, crew: Crew, progress: Progress) -> Plan:
     if spool.samples > most:
         progress.stage("count", spool.samples)
 
     def positions(number: int) -> NDArray[np.float64]:
-        return spool.read(spool.blocks[number], ("xyz",))["xyz"]
+        return frame.places(spool.read(spool.blocks[number], ("xyz",))["xyz"])
 
     blocks, journal = len(spool.blocks), folder.journal("count")
     return make_plan(cells, spool.samples, most, positions, blocks, crew, progress, journal)
@@ -124,7 +125,7 @@ def _count(spool: Spool, cells: Cells, most: int, folder: Folder, crew: Crew, pr
 
 def _scatter(
     spool: Spool,
-    cells: Cells,
+    frame: Frame,
     plan: Plan,
     limits: NDArray[np.uint64],
     seed: int,
@@ -137,7 +138,7 @@ def _scatter(
     progress.stage("scatter", spool.samples)
 
     def one(block: Block) -> Scattered:
-        return scatter(block, spool, cells, plan, limits, seed, schema, regions.dtype)
+        return scatter(block, spool, frame, plan, limits, seed, schema, regions.dtype)
 
     def placed(blocks: Iterable[Block]) -> Iterator[tuple[Block, Scattered, NDArray[np.int64]]]:
         for block, part in crew.map(one, blocks):
@@ -203,8 +204,8 @@ def _partition(
 
 
 def _partition_bucket(number: int, *, plan: Plan, upper: Upper, regions: Rows, most: int, **shared: Any) -> BucketTree:
-    bucket, above = plan.buckets[number], upper.above(number)
-    first, limits = int(regions.first[number]), [upper.nodes[node].threshold for node in above]
+    bucket, above, shares = plan.buckets[number], upper.above(number), upper.shares[number]
+    first = int(regions.first[number])
     if bucket.coincident:
-        return partition_pile(first, bucket, above, limits, most=most, regions=regions, **shared)
-    return partition(first, bucket, above, limits, regions=regions, **shared)
+        return partition_pile(first, bucket, above, shares, most=most, regions=regions, **shared)
+    return partition(first, bucket, above, shares, regions=regions, **shared)

@@ -16,13 +16,12 @@ from numba import njit
 
 from lpc.bounds import decode_centers, quantise_cones, quantise_spheres
 from lpc.codec import Effort, encode_clouds
-from lpc.context import ANCESTORS
-from lpc.lattice import quantise
+from lpc.context import ANCESTORS, with_ancestors
 from lpc.octahedral import decode_normals, encode_normals
 from lpc.octahedral_compiled import unit_vectors
 from lpc.page import RECORD
 
-from .rows import positions
+from .extend import OWNER
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -30,6 +29,8 @@ if TYPE_CHECKING:
     from lpc.attributes import Schema
 
     from .assemble import Nodes
+    from .extend import OldClouds
+    from .frame import Frame
     from .rows import Rows
 
 
@@ -55,10 +56,12 @@ class Geometry:
     axis: NDArray[np.float32]
 
     @classmethod
-    def of(cls, nodes: Nodes, origin: NDArray[np.float64], high: NDArray[np.float64], step: float) -> Geometry:
-        """Choose centres and axes; the lattice begins at the corner `origin` of the box up to `high`."""
-        side = float((high - origin).max()) * (1 + 2.0**-20) or 1.0
-        center = nodes.box[:, :3] + (nodes.box[:, 3:] - nodes.box[:, :3]) / 2
+    def of(cls, nodes: Nodes, frame: Frame) -> Geometry:
+        """Choose centres and axes."""
+        origin, step = frame.origin, frame.step
+        top = np.maximum(frame.high, nodes.box[0, 3:] * step + origin)
+        side = float((top - origin).max()) * (1 + 2.0**-20) or 1.0
+        center = (nodes.box[:, :3] + nodes.box[:, 3:]) * (step / 2) + origin
         codes = np.clip(np.rint((center - origin) * (2.0**32 / side)), 0, 2**32 - 1).astype(np.uint32)
         length = np.sqrt((nodes.normals.astype(np.float64) ** 2).sum(axis=1))
         whole = (nodes.bare == 0) & (length > 0)
@@ -72,7 +75,7 @@ class Run:
     """Frames of consecutive nodes from `first` on, their sizes and checksums; a recalled run has no frames.
 
     `reach` and `spread` (k, levels): the largest squared distance of a cloud's samples to the centre of its ancestor
-    at each level, itself included, and of its normals to the ancestor's axis.
+    at each level, itself included, and of its normals to the ancestor's axis. `kept`: clouds of an older model.
     """
 
     first: int
@@ -81,6 +84,7 @@ class Run:
     checks: NDArray[np.uint32]
     reach: NDArray[np.float64]
     spread: NDArray[np.float64]
+    kept: int = 0
 
 
 def encode_run(
@@ -92,9 +96,10 @@ def encode_run(
     regions: Rows,
     schema: Schema,
     effort: Effort,
+    old: OldClouds | None = None,
 ) -> Run:
-    """Encode nodes `first` to `stop - 1`."""
-    family = _family(first, stop, nodes.parent)
+    """Encode nodes `first` to `stop - 1`, but for those that are clouds of an older model."""
+    family = with_ancestors(np.arange(first, stop), nodes.parent, ANCESTORS)
     before = len(family) - (stop - first)
     bounds = np.concatenate([[0], np.cumsum(nodes.samples[family])])
     rows = np.empty(bounds[-1], regions.dtype)
@@ -104,11 +109,16 @@ def encode_run(
             count = int(nodes.run_count[run])
             regions.read(int(nodes.run_first[run]), rows[at : at + count])
             at += count
-    lattice = quantise(positions(rows), geometry.origin, geometry.step)
+    lattice = rows["xyz"].astype(np.int64)
     codes = {attribute.name: rows[attribute.name] for attribute in schema}
     place = np.searchsorted(family, nodes.parent[family])
     parent = np.where(family[place] == nodes.parent[family], place, -1)
-    frames = encode_clouds(lattice, codes, bounds, schema, parent=parent, first=before, effort=effort)
+    copies = None if old is None else old.copies(lattice, rows[OWNER], bounds, before)
+    frames = encode_clouds(
+        lattice, codes, bounds, schema, parent=parent, first=before, effort=effort,
+        known=None if copies is None else copies.frame,
+    )  # fmt: skip
+    kept = 0 if copies is None else copies.count
     own = int(bounds[before])
     lattice, rows, bounds = lattice[own:], rows[own:], bounds[before:] - own
     shape = (stop - first, int(nodes.depth[first:stop].max()) + 1)
@@ -119,17 +129,7 @@ def encode_run(
             normals = unit_vectors(rows[attribute.name], attribute.bits)
             _spread(normals, bounds, first, nodes.parent, nodes.depth, geometry.axis, spread)
     sizes = np.array([len(frame) for frame in frames], np.uint32)
-    return Run(first, frames, sizes, np.array([zlib.crc32(frame) for frame in frames], np.uint32), reach, spread)
-
-
-def _family(first: int, stop: int, parent: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Nodes `first` to `stop - 1`, after those that are context of theirs."""
-    above = line = np.arange(first, stop)
-    for _ in range(ANCESTORS):
-        line = np.unique(parent[line])
-        line = line[line >= 0]
-        above = np.union1d(above, line)
-    return above
+    return Run(first, frames, sizes, np.array([zlib.crc32(frame) for frame in frames], np.uint32), reach, spread, kept)
 
 
 def kernels_are_loaded() -> bool:

@@ -37,6 +37,7 @@ LAYOUT = 2
 
 _ENDS = 1 << 16  # bytes hashed at both ends of an input
 _MANIFEST = "manifest.json"
+_WRITTEN = "written"
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +57,13 @@ class Folder:
     def journal(self, name: str) -> Journal:
         """Open the journal of a stage."""
         return Journal(self.path / f"{name}.journal")
+
+    def note_written(self, digest: str) -> None:
+        """Say which model is about to take its name; see `was_written`."""
+        file = self.path / _MANIFEST
+        if file.exists():
+            told = {"digest": digest, "build": _without_first(json.loads(file.read_bytes()))}
+            (self.path / _WRITTEN).write_text(json.dumps(told))
 
     def part_of(self, out: Path) -> Path:
         """Name of the unfinished model: in the folder, or beside the model if that is on another disk."""
@@ -146,17 +154,38 @@ def work_folder(
     """
     if not parent.is_dir():
         raise BuildError(f"there is no directory {parent} for temporary files; make it first")
-    name = f".{out.name}.build"
-    if parent.resolve() != out.parent.resolve():  # models of one name in several places may share --scratch
-        name = f".{out.name}.{hashlib.blake2b(os.fsencode(out.resolve()), digest_size=4).hexdigest()}.build"
-    path = parent / name
+    path = _path_of(parent, out)
     lock = _lock(path, out)
     try:
         yield Folder(path, _recall(path, manifest, tell))
     finally:
         (path / _MANIFEST).unlink(missing_ok=True)  # first: what is half removed must not be recalled
+        Folder(path).remove(f"[!{_WRITTEN[0]}]*")  # last: what was written must not be built on
         shutil.rmtree(path, ignore_errors=True)
         os.close(lock)
+
+
+def _path_of(parent: Path, out: Path) -> Path:
+    if parent.resolve() == out.parent.resolve():
+        return parent / f".{out.name}.build"
+    # Models of one name in several places may share --scratch.
+    return parent / f".{out.name}.{hashlib.blake2b(os.fsencode(out.resolve()), digest_size=4).hexdigest()}.build"
+
+
+def was_written(parent: Path, out: Path, manifest: dict[str, Any], digest: str) -> bool:
+    """Whether the build of a manifest was killed when it had written the model of a digest, but not yet tidied up.
+
+    The first input does not count: where scans are added to a model, it is the model itself.
+    """
+    try:
+        found = json.loads((_path_of(parent, out) / _WRITTEN).read_bytes())
+    except (OSError, ValueError):
+        return False
+    return bool(found == {"digest": digest, "build": _without_first(manifest)})
+
+
+def _without_first(manifest: dict[str, Any]) -> dict[str, Any]:
+    return {**manifest, "inputs": manifest["inputs"][1:]}
 
 
 def _lock(path: Path, out: Path) -> int:

@@ -12,6 +12,7 @@ from lpc.attributes import MAX_ATTRIBUTES
 from lpc.errors import BuildError
 from lpc.points import PointBatch
 
+from .extend import OWNER, OldModel
 from .readers import Scan, open_scan
 from .readers.detect import SUFFIXES
 from .readers.directory import scan_files
@@ -82,10 +83,14 @@ class Inputs:
         return cls((), dtypes, entry["left_out"], entry["crs"])
 
     def batches(self, size: int) -> Iterator[PointBatch]:
-        """Yield the samples of all scans with the common attributes only."""
+        """Yield the samples of all scans with the common attributes only; after a model's, with `OWNER`."""
+        owned = isinstance(self.scans[0], OldModel)
         for scan in self.scans:
             for batch in scan.batches(size):
-                yield PointBatch(batch.xyz, {name: batch.attributes[name] for name in self.attributes})
+                values = {name: batch.attributes[name] for name in self.attributes}
+                if owned:
+                    values[OWNER] = batch.attributes.get(OWNER, np.zeros(len(batch), np.uint32))
+                yield PointBatch(batch.xyz, values)
 
 
 def expand(sources: Sequence[Source]) -> list[Source]:
@@ -164,7 +169,9 @@ def open_inputs(
     attributes = {name: dtype for name, dtype in attributes.items() if name not in left_out}
     if len(attributes) > MAX_ATTRIBUTES:
         raise BuildError(f"{len(attributes)} attributes are too many: name at most {MAX_ATTRIBUTES} with --attributes")
-    return Inputs(scans, attributes, left_out, first.crs, notes)
+    # In an order of their own, whatever that of the files.
+    ordered = sorted(attributes, key=lambda name: (name != "normal", name != "color", name))
+    return Inputs(scans, {name: attributes[name] for name in ordered}, left_out, first.crs, notes)
 
 
 def _differences(scans: tuple[Scan, ...], left_out: dict[str, str]) -> Iterator[str]:

@@ -29,6 +29,8 @@ class BuildOptions:
         M, samples of a cloud, 1 to 65,535 (LPC 3; 512 to 8,192 are sensible).
     position_error : float or None *
         Largest distance between a sample and its decoded position, model units; None: half the spacing.
+    step : float or None *
+        Edge of a lattice cell, model units, in place of what follows from `position_error`.
     seed : int *
         Of the hash that picks the samples of a node.
     normals : {"auto", "keep", "estimate", "drop"} *
@@ -58,6 +60,7 @@ class BuildOptions:
 
     cloud_size: int = 2048
     position_error: float | None = None
+    step: float | None = None
     seed: int = 0
     normals: Literal["auto", "keep", "estimate", "drop"] = "auto"
     attributes: tuple[str, ...] | None = None

@@ -1,12 +1,16 @@
 """A bucket of samples at one place, however many: no path tells them apart, so none is sorted in memory with all.
 
 Their tree is a chain of nodes that takes them by priority. So a pile is sorted by priority, in slices of priorities
-that fit into memory, and its clouds are cut off one after another. The result is that of `bucket.partition`.
+that fit into memory, and its clouds are cut off one after another. The result is that of `bucket.partition`. Equal
+samples have equal priorities, and there may be more of them than fit: these are only counted.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import os
+from collections import Counter
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,12 +20,13 @@ from lpc.page import COINCIDENT
 
 from .areas import Probing, pile_spacing
 from .bucket import BucketTree, Clouds, summarise
+from .priority import COPY
 from .rows import positions
 from .spool import read_all, write_all
 from .tree import TOO_MANY, Tree
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -30,7 +35,7 @@ if TYPE_CHECKING:
     from .rows import Rows
 
 SLICE_BITS = 16
-"""Priorities with the same first bits stay in one slice; hashes, they are few."""
+"""Priorities with the same first bits stay in one slice; hashes, they are few, or they are equal."""
 
 CHUNK = 1 << 14
 """Rows looked at together where a few arrays of them are made."""
@@ -46,7 +51,7 @@ def partition_pile(
     first_row: int,
     bucket: Bucket,
     above: list[int],
-    thresholds: list[int],
+    shares: list[int],
     *,
     most: int,
     cells: Cells,
@@ -61,7 +66,7 @@ def partition_pile(
     ----------
     most : int
         Rows to hold in memory.
-    first_row, bucket, above, thresholds, cells, probing, cloud_size, regions, normal_bits
+    first_row, bucket, above, shares, cells, probing, cloud_size, regions, normal_bits
         As for `bucket.partition`.
 
     Raises
@@ -69,7 +74,8 @@ def partition_pile(
     BuildError
         If more samples coincide than a chain of nodes can hold.
     """
-    taken = _sort_by_priority(first_row, bucket.count, thresholds, most, regions)
+    taken = np.array(shares, np.int64)
+    _sort_by_priority(first_row, bucket.count, most, regions)
     ordered = regions.replaced()
     left = bucket.count - int(taken.sum())
     first = cells.fixed(positions(next(regions.chunks(first_row, 1, 1))))
@@ -103,32 +109,75 @@ def partition_pile(
     )
 
 
-def _sort_by_priority(first_row: int, count: int, thresholds: list[int], most: int, regions: Rows) -> NDArray[np.int64]:
-    """Sort the rows; how many each of the nodes above takes."""
-    limits = np.array(thresholds, np.uint64)
+def _sort_by_priority(first_row: int, count: int, most: int, regions: Rows) -> None:
+    """Sort the rows, about `most` at a time, and let copies come last."""
     shift = np.uint64(64 - SLICE_BITS)
     histogram = np.zeros(1 << SLICE_BITS, np.int64)
-    taken = np.zeros(len(limits) + 1, np.int64)
     for rows in regions.chunks(first_row, count, CHUNK):
         histogram += np.bincount((rows["priority"] >> shift).astype(np.int64), minlength=len(histogram))
-        taken += np.bincount(np.searchsorted(limits, rows["priority"]), minlength=len(taken))
     slice_of = np.maximum(np.cumsum(histogram) - 1, 0) // most
     sizes = np.bincount(slice_of, histogram).astype(np.int64)
     starts = np.cumsum(sizes) - sizes
-    filled = starts.copy()
+    heavy = sizes > 2 * most
     size = regions.dtype.itemsize
-    with regions.rewriting(first_row) as file:
+
+    def parts(wanted: NDArray[np.bool_]) -> Iterator[tuple[int, NDArray[Any]]]:
         for rows in regions.chunks(first_row, count, CHUNK):
             number = slice_of[(rows["priority"] >> shift).astype(np.int64)]
-            for each in np.unique(number):
-                part = rows[number == each]
-                write_all(file, part, int(filled[each]) * size)
-                filled[each] += len(part)
-        for start, length in zip(starts.tolist(), sizes.tolist(), strict=True):
+            for each in np.unique(number[wanted[number]]).tolist():
+                yield each, rows[number == each]
+
+    with regions.rewriting(first_row) as file:
+        filled = count + starts  # behind the place of the rows, which copies are still among
+        for each, part in parts(~heavy):
+            write_all(file, part, int(filled[each]) * size)
+            filled[each] += len(part)
+        for start, length in zip((count + starts[~heavy]).tolist(), sizes[~heavy].tolist(), strict=True):
             rows = np.empty(length, regions.dtype)
             read_all(file, rows, start * size)
             write_all(file, rows[np.argsort(rows["priority"])], start * size)
-    return taken[:-1]
+        for each in np.flatnonzero(heavy).tolist():
+            _place_equals(partial(parts, np.arange(len(heavy)) == each), count + int(starts[each]), file, size)
+        _split_copies(count, file, regions.dtype)
+        os.truncate(file, count * size)
+
+
+def _place_equals(parts: Callable[[], Iterator[tuple[int, NDArray[Any]]]], start: int, file: int, size: int) -> None:
+    """Write rows in order from row `start` on: many rows, but of few priorities, since most are equal."""
+    counts: Counter[int] = Counter()
+    for _, part in parts():
+        values, times = np.unique(part["priority"], return_counts=True)
+        counts.update(dict(zip(values.tolist(), times.tolist(), strict=True)))
+    place = {}
+    for value in sorted(counts):
+        place[value] = start
+        start += counts[value]
+    for _, part in parts():
+        ordered = part[np.argsort(part["priority"])]
+        values, first = np.unique(ordered["priority"], return_index=True)
+        for value, run in zip(values.tolist(), np.split(ordered, first[1:]), strict=True):
+            write_all(file, run, place[value] * size)
+            place[value] += len(run)
+
+
+def _split_copies(count: int, file: int, dtype: np.dtype[Any]) -> None:
+    """Move `count` sorted rows from row `count` on to the start, first those that are no copies."""
+
+    def parts() -> Iterator[tuple[NDArray[Any], NDArray[np.bool_]]]:
+        last = COPY  # no row has it
+        for at in range(count, 2 * count, CHUNK):
+            rows = np.empty(min(CHUNK, 2 * count - at), dtype)
+            read_all(file, rows, at * dtype.itemsize)
+            priority = rows["priority"]
+            yield rows, priority == np.append(last, priority[:-1])
+            last = priority[-1]
+
+    places = [0, sum(int((~copy).sum()) for _, copy in parts())]
+    for rows, copy in parts():
+        for kind, which in enumerate((~copy, copy)):
+            chosen = rows[which]  # as they are: a build that was killed may sort them again
+            write_all(file, chosen, places[kind] * dtype.itemsize)
+            places[kind] += len(chosen)
 
 
 def _chain(bucket: Bucket, left: int, cloud_size: int, cells: Cells, fixed: NDArray[np.uint64]) -> Tree:

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from lpc.errors import BuildError
 from lpc.header import Header
-from lpc.lattice import EPSILON, SLACK, position_error_bound, position_step
+from lpc.lattice import position_error_bound
 
 from .costs import cloud_costs, seal_with_costs
 from .encode import Geometry, Records, Run, encode_run
+from .extend import PACKING, packing_of
 from .spacing import node_spacings
 from .write import write_model
 
@@ -27,7 +27,9 @@ if TYPE_CHECKING:
 
     from .assemble import Nodes
     from .divide import Division
+    from .extend import OldClouds
     from .folder import Folder
+    from .frame import Frame
     from .inputs import Inputs
     from .journal import Journal
     from .options import BuildOptions
@@ -48,6 +50,7 @@ COSTED_CLOUDS = 256
 def publish(
     division: Division,
     found: Survey,
+    frame: Frame,
     inputs: Inputs,
     options: BuildOptions,
     *,
@@ -55,13 +58,14 @@ def publish(
     out: Path,
     crew: Crew,
     progress: Progress,
-) -> Header:
-    """Write the model and give its header.
+    old: OldClouds | None = None,
+) -> tuple[Header, int]:
+    """Write the model; its header, and how many clouds of an older model are in it.
 
     Parameters
     ----------
-    division, found, inputs
-        The tree, what the survey found, and what is known of the scans.
+    division, found, frame, inputs
+        The tree, what the survey found, the lattice, and what is known of the scans.
     options : BuildOptions
     folder : Folder
         Keeps the clouds until they are all there, and the journal of them.
@@ -69,24 +73,19 @@ def publish(
         The model.
     crew, progress
         Threads, and who is told.
-
-    Raises
-    ------
-    BuildError
-        If no lattice can hold the samples within the wanted error.
+    old : OldClouds, optional
+        Clouds that need not be encoded.
     """
-    nodes = division.nodes
-    extent = float((found.high - found.low).max())
-    far = float(np.abs([found.low, found.high]).max())
-    step = choose_step(division.spacing, extent, options.position_error, far=far)
-    geometry = Geometry.of(nodes, found.low, found.high, step)
+    nodes, step = division.nodes, frame.step
+    geometry = Geometry.of(nodes, frame)
     spacing, ratio = node_spacings(nodes, division.spacing, step)
     progress.stage("encode", int(nodes.subtree[0]))
     path = folder.path / "clouds"
     path.touch()
     with path.open("r+b") as clouds:
         records = Records(nodes, geometry, spacing)
-        costs = _encode(records, clouds, folder.journal("encode"), division.rows, found, options.effort, crew, progress)
+        journal = folder.journal("encode")
+        costs, kept = _encode(records, clouds, journal, division.rows, found, options.effort, old, crew, progress)
         division.rows.remove()  # their room is the model's
         header = Header(
             bytes=2**53,
@@ -95,12 +94,12 @@ def publish(
             levels=int(nodes.depth.max()) + 1,
             cloud_size=options.cloud_size,
             page_nodes=options.page_nodes,
-            origin=_triple(found.low),
+            origin=_triple(frame.origin),
             step=step,
             side=geometry.side,
             bounds=(*_triple(found.low), *_triple(found.high)),
-            spacing=division.spacing,
-            position_error=position_error_bound(step, found.low, extent),
+            spacing=frame.spacing or division.spacing * step,
+            position_error=position_error_bound(step, frame.origin, geometry.side),
             attributes=found.schema,
             constants=found.constants,
             crs=inputs.crs,
@@ -109,35 +108,15 @@ def publish(
             spacing_ratio=ratio,
             seed=options.seed,
             generator=GENERATOR,
+            extra={PACKING: packing_of(options)},
         )
         finished = records.finish()
         header = seal_with_costs(header, finished, costs, clouds.tell())
+        folder.note_written(header.digest)
         progress.stage("write", header.samples)
         write_model(out, folder.part_of(out), header, finished, clouds)
     progress.advance(header.samples)
-    return header
-
-
-def choose_step(spacing: float, extent: float, position_error: float | None, *, far: float = 0.0) -> float:
-    """Edge of a lattice cell.
-
-    Samples that all coincide are the lattice's origin, whatever its step: it is what float64 tells apart at the
-    largest coordinate, `far`.
-
-    Raises
-    ------
-    BuildError
-        If half the spacing as a bound takes more bits than a coordinate has, or the wanted error does.
-    """
-    if position_error is None and extent == 0.0:
-        return EPSILON * (far or 1.0)
-    step = position_step(spacing, extent, position_error)
-    if position_error is None and spacing > 0 and step > SLACK * spacing:
-        raise BuildError(
-            f"the samples are {spacing:g} apart but spread over {extent:g}, more than 48 bits a coordinate can tell: "
-            "remove the outliers, or allow a larger --position-error"
-        )
-    return step
+    return header, kept
 
 
 def _encode(
@@ -147,19 +126,25 @@ def _encode(
     regions: Rows,
     found: Survey,
     effort: Effort,
+    old: OldClouds | None,
     crew: Crew,
     progress: Progress,
-) -> NDArray[np.float64]:
-    """Write all clouds in order and fill the records; what positions and attributes cost in some of them."""
+) -> tuple[NDArray[np.float64], int]:
+    """Write all clouds in order and fill the records.
+
+    Returns what positions and attributes cost in some of the clouds, and how many are old.
+    """
     nodes, geometry = records.nodes, records.geometry
     costed = np.unique(np.linspace(0, len(nodes) - 1, COSTED_CLOUDS).astype(int))
     schema = found.schema
     one = partial(
-        _encode_run, costed=costed, nodes=nodes, geometry=geometry, regions=regions, schema=schema, effort=effort
-    )
+        _encode_run, costed=costed, nodes=nodes, geometry=geometry, regions=regions, schema=schema, effort=effort,
+        old=old,
+    )  # fmt: skip
     costs = np.zeros(1 + len(found.schema))
-    waiting = runs(nodes, RUN_SAMPLES)
-    for sizes, checks, reach, spread, part in journal:
+    waiting, kept = runs(nodes, RUN_SAMPLES), 0
+    for sizes, checks, reach, spread, part, same in journal:
+        kept += int(same)
         first, stop = waiting.pop(0)
         records.add(Run(first, [], sizes, checks, reach, spread))
         costs += part
@@ -171,9 +156,10 @@ def _encode(
         clouds.flush()
         records.add(run)
         costs += part
-        journal.add(run.sizes, run.checks, run.reach, run.spread, part)
+        kept += run.kept
+        journal.add(run.sizes, run.checks, run.reach, run.spread, part, np.array(run.kept))
         progress.advance(int(nodes.samples[first:stop].sum()))
-    return costs
+    return costs, kept
 
 
 def _encode_run(

@@ -1,8 +1,7 @@
 """A sample as one row of bytes: what the passes after the survey move around.
 
-A row holds the priority, the position as it came (float64, or float32 where all of the input is, so that the
-final quantisation is as exact as the input), and the attribute codes. Rows are whole 8-byte words, which is how kernels
-copy them.
+A row holds the priority, the lattice point and the attribute codes. Rows are whole 8-byte words, which is how kernels
+copy and hash them.
 """
 
 from __future__ import annotations
@@ -11,6 +10,9 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+
+from .extend import OWNER
+from .priority import priorities
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -54,13 +56,13 @@ class Rows(Protocol):
         """Remove the files."""
 
 
-def row_dtype(schema: Schema, *, single: bool = False) -> np.dtype[Any]:
+def row_dtype(schema: Schema, *, short: bool = True, owned: bool = False) -> np.dtype[Any]:
     """Fields ``priority``, ``xyz`` and one per attribute, widest first, padded to whole words.
 
-    `single`: positions are float32 without loss.
+    `short`: lattice coordinates have 32 bits. `owned`: there is also `OWNER`, in a word of its own.
     """
-    names, formats, offsets = ["priority", "xyz"], ["<u8", "(3,)<f4" if single else "(3,)<f8"], [0, 8]
-    end = row_start(single)
+    names, formats, offsets = ["priority", "xyz"], ["<u8", "(3,)<i4" if short else "(3,)<i8"], [0, 8]
+    end = row_start(short)
     for attribute in sorted(schema, key=lambda entry: -entry.code_dtype.itemsize):
         item = attribute.code_dtype
         end = -(-end // item.itemsize) * item.itemsize
@@ -69,12 +71,17 @@ def row_dtype(schema: Schema, *, single: bool = False) -> np.dtype[Any]:
         formats.append(f"{shape}<u{item.itemsize}")
         offsets.append(end)
         end += item.itemsize * attribute.components
+    if owned:
+        names.append(OWNER)
+        formats.append("<u4")
+        offsets.append(whole_words(end))
+        end = offsets[-1] + 8
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": whole_words(end)})
 
 
-def row_start(single: bool) -> int:
+def row_start(short: bool) -> int:
     """Bytes of a row before its attributes."""
-    return 20 if single else 32
+    return 20 if short else 32
 
 
 def whole_words(size: int) -> int:
@@ -83,12 +90,12 @@ def whole_words(size: int) -> int:
 
 
 def positions(rows: NDArray[Any]) -> NDArray[np.float64]:
-    """Positions (n, 3) of rows, as they came."""
+    """Lattice coordinates (n, 3) of rows."""
     return rows["xyz"].astype(np.float64, order="C")
 
 
 def fill_rows(
-    dtype: np.dtype[Any], values: Mapping[str, NDArray[Any]], priority: NDArray[np.uint64], schema: Schema
+    dtype: np.dtype[Any], places: NDArray[np.float64], values: Mapping[str, NDArray[Any]], schema: Schema, seed: int
 ) -> NDArray[Any]:
     """Rows of spooled samples.
 
@@ -96,17 +103,23 @@ def fill_rows(
     ----------
     dtype : dtype
         Of `row_dtype`.
+    places : ndarray, (n, 3) float64
+        Lattice coordinates.
     values : mapping of str to ndarray
         Spool columns; normals are codes already.
-    priority : ndarray, (n,) uint64
     schema : Schema
+    seed : int
+        Of the priorities.
     """
-    rows = np.zeros(len(priority), dtype)
-    rows["xyz"] = values["xyz"]
-    rows["priority"] = priority
+    rows = np.zeros(len(places), dtype)
+    rows["xyz"] = places
     for attribute in schema:
         column = values[attribute.name]
         rows[attribute.name] = column if attribute.kind == "normal" else encode_values(attribute, column)
+    words = as_words(rows)
+    rows["priority"] = priorities(words[:, 1:-1] if OWNER in values else words[:, 1:], seed)
+    if OWNER in values:
+        rows[OWNER] = values[OWNER]
     return rows
 
 

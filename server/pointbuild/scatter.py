@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba import njit
 
-from .priority import priorities
+from .extend import OWNER
 from .rows import as_words, fill_rows
 from .spool import Block, Spool, read_all, write_all
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from lpc.attributes import Schema
 
-    from .cells import Cells
+    from .frame import Frame
     from .plan import Plan
 
 
@@ -164,7 +164,7 @@ class Regions:
 def scatter(
     block: Block,
     spool: Spool,
-    cells: Cells,
+    frame: Frame,
     plan: Plan,
     limits: NDArray[np.uint64],
     seed: int,
@@ -177,7 +177,7 @@ def scatter(
     ----------
     block, spool
         What to read.
-    cells, plan
+    frame, plan
         Where samples belong.
     limits : ndarray, (buckets,) uint64
         Priorities up to these are candidates.
@@ -186,12 +186,12 @@ def scatter(
     schema, dtype
         What rows hold and look like.
     """
-    values = spool.read(block, ("xyz", *(attribute.name for attribute in schema)))
-    priority = priorities(block.first, block.samples, seed)
-    rows = fill_rows(dtype, values, priority, schema)
-    bucket = plan.locate(cells, values["xyz"])
+    values = spool.read(block, ("xyz", OWNER, *(attribute.name for attribute in schema)))
+    places = frame.places(values["xyz"])
+    rows = fill_rows(dtype, places, values, schema, seed)
     if len(plan.buckets) == 1:
         return Scattered(rows, np.array([block.samples]), Candidates(np.empty(0, np.uint64), np.empty(0, np.int32)))
+    bucket, priority = plan.locate(frame.cells, places), rows["priority"]
     counts = np.bincount(bucket, minlength=len(plan.buckets))
     out = np.empty_like(rows)
     _sort_rows(as_words(rows), bucket, np.cumsum(counts) - counts, as_words(out))

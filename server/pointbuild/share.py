@@ -10,7 +10,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import uuid
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -44,57 +44,53 @@ class Share:
 
     def put(self, name: str, source: BinaryIO) -> None:
         """Copy a file from its start; nobody ever sees half of the copy."""
-        files, root = self._files()
-        # A store shows a file when it is complete; a folder would show it before.
-        part = f"{name}.{uuid.uuid4().hex}" if _is_folder(files) else name
         source.seek(0)
-        try:
+        with self._files("cannot be written to") as (files, root):
+            # A store shows a file when it is complete; a folder would show it before.
+            part = f"{name}.{uuid.uuid4().hex}" if _is_folder(files) else name
             with files.open(f"{root}/{part}", "wb") as target:
                 shutil.copyfileobj(source, target, _PIECE)
             if part != name:
                 Path(root, part).replace(Path(root, name))
-        except OSError as error:
-            raise BuildError(f"{self.url} cannot be written to: {error}") from error
 
     def get(self, name: str, start: int | None = None, stop: int | None = None) -> bytes:
         """Bytes `start` to `stop` of a file."""
-        files, root = self._files()
-        try:
-            found: bytes = files.cat_file(f"{root}/{name}", start, stop)
-        except OSError as error:
-            raise BuildError(
-                f"{self.url} does not hold {name}, or a worker does not reach it: name a folder or a store that all "
-                f"machines share ({error})"
-            ) from error
+        absent = (
+            f"does not hold {name}, or a worker does not reach it: name a folder or a store that all machines share"
+        )
+        with self._files(absent) as (files, root):
+            found: bytes = files.cat_file(f"{root}/{name}", start=start, end=stop)  # by name: stores order them unlike
         return found
 
     def remove(self, name: str) -> None:
         """Remove a file that is there."""
-        files, root = self._files()
-        files.rm_file(f"{root}/{name}")
+        with self._files("cannot be cleared") as (files, root):
+            files.rm_file(f"{root}/{name}")
 
     def make(self) -> None:
-        """Make the folder."""
-        files, root = self._files()
-        try:
-            files.makedirs(root, exist_ok=True)
-        except OSError as error:
-            raise BuildError(f"{self.url} cannot be made: {error}") from error
+        """Make the folder; in a store, see that what it would be in is there."""
+        with self._files("cannot be made") as (files, root), suppress(FileExistsError):
+            # Parents in a store are buckets, and a misspelt one is not to be made.
+            files.mkdir(root, create_parents=_is_folder(files))
 
     def clear(self) -> None:
         """Remove everything, the folder too."""
-        files, root = self._files()
-        if files.exists(root):
-            files.rm(root, recursive=True)
+        with self._files("cannot be cleared") as (files, root):
+            if files.exists(root):
+                files.rm(root, recursive=True)
 
-    def _files(self) -> tuple[AbstractFileSystem, str]:
+    @contextmanager
+    def _files(self, problem: str) -> Iterator[tuple[AbstractFileSystem, str]]:
+        """Give the file system and the folder in it; whatever goes wrong becomes a sentence."""
         from fsspec.core import url_to_fs  # part of the extra "cluster"
 
         try:
-            files, root = url_to_fs(self.url)
-        except (ImportError, ValueError) as error:
-            raise BuildError(f"{self.url}: {error}") from error
-        return files, str(root)
+            # Listings that are kept would not know what workers have put there since.
+            files, root = url_to_fs(self.url, use_listings_cache=False)
+            yield files, str(root)
+        except Exception as error:  # every kind of store has exceptions of its own, and few are OSError
+            why = " ".join(str(error).split()) or type(error).__name__
+            raise BuildError(f"{self.url} {problem} ({why})") from error
 
 
 def _is_folder(files: AbstractFileSystem) -> bool:

@@ -25,7 +25,7 @@ def model_spacing(spacing: NDArray[np.float64], weight: NDArray[np.integer]) -> 
     Returns
     -------
     float
-        Model units; 0 if there is no region.
+        In the unit of `spacing`; 0 if there is no region.
     """
     if not len(spacing):
         return 0.0
@@ -45,19 +45,20 @@ def node_spacings(nodes: Nodes, spacing: float, step: float) -> tuple[NDArray[np
     ----------
     nodes : Nodes
     spacing : float
-        r of the model.
+        r of the model, lattice steps, as the areas of nodes.
     step : float
-        Of the lattice.
+        Of the lattice, model units.
 
     Returns
     -------
     stored : ndarray, (n,) float32
+        Model units.
     ratio : tuple of three floats
         5, 50 and 95 % of the nodes have a smaller ratio of the stored spacing to that of the equations.
     """
     if spacing == 0.0:
         return np.zeros(len(nodes), np.float32), (1.0, 1.0, 1.0)
-    stored = np.maximum(np.sqrt(nodes.area / nodes.drawn), step).astype(np.float32)
-    uniform = spacings(nodes.subtree, nodes.samples, nodes.parent, spacing)
+    stored = (np.maximum(np.sqrt(nodes.area / nodes.drawn), 1.0) * step).astype(np.float32)
+    uniform = spacings(nodes.subtree, nodes.samples, nodes.parent, spacing * step)
     low, middle, high = np.percentile(stored / uniform, [5, 50, 95]).tolist()
     return stored, (low, middle, high)

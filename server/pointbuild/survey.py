@@ -6,7 +6,7 @@ That is the bounding box, the records to reject, which attributes are constant, 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,8 @@ from lpc.constants import Constant
 from lpc.errors import ScanError
 from lpc.octahedral import encode_normals
 
+from .estimate import Sketch
+from .extend import OWNER
 from .readers import finite
 from .spool import Block, Column, Spool
 
@@ -64,8 +66,8 @@ class Survey:
         Attributes that turned out to say nothing.
     rejected : dict of str to int
         Dropped records by reason.
-    single : bool
-        All coordinates are float32 numbers.
+    sketch : Sketch
+        Random samples.
     """
 
     low: NDArray[np.float64]
@@ -74,17 +76,16 @@ class Survey:
     constants: dict[str, Constant]
     left_out: dict[str, str]
     rejected: dict[str, int]
-    single: bool = False
+    sketch: Sketch = field(default_factory=Sketch)
 
     def to_json(self) -> dict[str, Any]:
-        """Give everything as plain values; numbers keep all their bits."""
+        """Give everything but the sketch as plain values; numbers keep all their bits."""
         return {
             "box": [self.low.tolist(), self.high.tolist()],
             "schema": [attribute.to_json() for attribute in self.schema],
             "constants": {name: constant.to_json() for name, constant in self.constants.items()},
             "left_out": self.left_out,
             "rejected": self.rejected,
-            "single": self.single,
         }
 
     @classmethod
@@ -98,12 +99,11 @@ class Survey:
             {name: Constant.from_json(constant) for name, constant in entry["constants"].items()},
             entry["left_out"],
             entry["rejected"],
-            entry["single"],
         )
 
 
-def columns_of(attributes: dict[str, np.dtype[Any]], precision: Precision) -> tuple[Column, ...]:
-    """Columns of the spool: positions as they came, normals as codes, everything else as it came."""
+def columns_of(attributes: dict[str, np.dtype[Any]], precision: Precision, *, owned: bool) -> tuple[Column, ...]:
+    """Columns of the spool: positions as they came, normals as codes, everything else as it came, and `OWNER`."""
     columns = [Column("xyz", np.dtype("<f8"), 3)]
     for name, dtype in attributes.items():
         if name == "normal":
@@ -111,10 +111,18 @@ def columns_of(attributes: dict[str, np.dtype[Any]], precision: Precision) -> tu
             columns.append(Column(name, np.dtype(code), 2))
         else:
             columns.append(Column(name, dtype.newbyteorder("<"), 3 if name == "color" else 1))
-    return tuple(columns)
+    return (*columns, Column(OWNER, np.dtype("<u4"))) if owned else tuple(columns)
 
 
-def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Progress, precision: Precision) -> Survey:
+def survey(
+    batches: Iterable[PointBatch],
+    spool: Spool,
+    crew: Crew,
+    progress: Progress,
+    precision: Precision,
+    *,
+    sketched: bool = True,
+) -> Survey:
     """Fill the spool.
 
     Parameters
@@ -127,6 +135,8 @@ def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Pr
         Prepares batches while the next one is read.
     progress : Progress
     precision : Precision
+    sketched : bool
+        Random samples are wanted.
 
     Raises
     ------
@@ -134,17 +144,16 @@ def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Pr
         If no sample is left.
     """
     box = np.array([[np.inf] * 3, [-np.inf] * 3])
-    single = True
+    sketch = Sketch()
     rejected: dict[str, int] = {}
-    ranges = {column.name: _Range(column) for column in spool.columns[1:]}
-    prepare = partial(_prepare, normal_bits=precision.normal_bits)
+    ranges = {column.name: _Range(column) for column in spool.columns[1:] if column.name != OWNER}
+    prepare = partial(_prepare, normal_bits=precision.normal_bits, sketched=sketched)
 
     def looked_at() -> Iterator[tuple[Block, dict[str, NDArray[Any]], int]]:
-        nonlocal single
-        for batch, (values, low, high, short, dropped) in crew.map(prepare, batches):
+        for batch, (values, low, high, drawn, dropped) in crew.map(prepare, batches):
             for reason, count in dropped.items():
                 rejected[reason] = rejected.get(reason, 0) + count
-            single = single and short
+            sketch.add(drawn)
             np.minimum(box[0], low, out=box[0])
             np.maximum(box[1], high, out=box[1])
             for name, found in ranges.items():
@@ -165,38 +174,37 @@ def survey(batches: Iterable[PointBatch], spool: Spool, crew: Crew, progress: Pr
             constants[name] = verdict
         else:
             left_out[name] = verdict
-    return Survey(box[0], box[1], tuple(schema), constants, left_out, {k: v for k, v in rejected.items() if v}, single)
+    return Survey(box[0], box[1], tuple(schema), constants, left_out, {k: v for k, v in rejected.items() if v}, sketch)
 
 
 def _prepare(
-    batch: PointBatch, normal_bits: int
-) -> tuple[dict[str, NDArray[Any]], NDArray[Any], NDArray[Any], bool, dict[str, int]]:
-    """Give the samples of a batch as columns, their box, whether they are float32 numbers, and what was dropped."""
+    batch: PointBatch, normal_bits: int, sketched: bool
+) -> tuple[dict[str, NDArray[Any]], NDArray[Any], NDArray[Any], Sketch, dict[str, int]]:
+    """Give the samples of a batch as columns, their box, some of them, and what was dropped."""
     dropped: dict[str, int] = {}
     box = np.empty((2, 3))
-    good, single = _box(batch.xyz, box)
+    good = _box(batch.xyz, box)
     if not good or (batch.normal is not None and not np.isfinite(batch.normal).all()):
         batch, dropped = finite(batch)
-        _, single = _box(batch.xyz, box)
+        _box(batch.xyz, box)
     values: dict[str, NDArray[Any]] = {"xyz": batch.xyz}
     for name, column in batch.attributes.items():
         values[name] = encode_normals(column, normal_bits) if name == "normal" else column
-    return values, box[0], box[1], single, dropped
+    return values, box[0], box[1], Sketch.of(batch.xyz) if sketched else Sketch(), dropped
 
 
 @njit(cache=True, nogil=True)
 def _box(xyz: Any, box: Any) -> Any:
-    """Fill in the box of (n, 3) positions; whether all are finite, and whether all are float32 numbers."""
-    good, single = True, True
+    """Fill in the box of (n, 3) positions; whether all are finite."""
+    good = True
     for axis in range(3):
         low, high = np.inf, -np.inf
         for i in range(len(xyz)):
             value = xyz[i, axis]
             low, high = min(low, value), max(high, value)
             good &= abs(value) < np.inf  # false for what is not a number
-            single &= float(np.float32(value)) == value
         box[0, axis], box[1, axis] = low, high
-    return good, single
+    return good
 
 
 class _Range:

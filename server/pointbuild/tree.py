@@ -67,7 +67,8 @@ def grow(
     priority: NDArray[np.uint64],
     scratch: NDArray[np.uint64],
     depth: int,
-    threshold: int,
+    taken: NDArray[np.int64],
+    floor: np.uint64,
     cloud_size: int,
 ) -> tuple[Tree, NDArray[np.int32]]:
     """Build the tree of a bucket.
@@ -82,8 +83,10 @@ def grow(
         Overwritten.
     depth : int
         Of the bucket's cell.
-    threshold : int
-        Priorities up to it are taken by the upper tree; -1: none.
+    taken : ndarray, (t,) int64
+        Samples that the upper tree takes.
+    floor : int
+        No other sample has a smaller priority.
     cloud_size : int
         M.
 
@@ -99,11 +102,13 @@ def grow(
         If more samples coincide than a chain of nodes can hold.
     """
     owner = np.full(len(fixed), -1, np.int32)
-    left = np.flatnonzero(priority > np.uint64(threshold)) if threshold >= 0 else np.arange(len(fixed))
+    free = np.ones(len(fixed), np.bool_)
+    free[taken] = False
+    left = np.flatnonzero(free)
     nodes = np.empty((7, 2 * (len(left) // cloud_size) + 3), np.int64)
     count = _grow(
         cells.axes, cells.shifts, fixed, left.astype(np.int32), priority[left], scratch,
-        depth, np.uint64(max(threshold, 0)), cloud_size, nodes, owner,
+        depth, floor, cloud_size, nodes, owner,
     )  # fmt: skip
     if count < 0:
         raise BuildError(TOO_MANY)
@@ -113,7 +118,7 @@ def grow(
 @njit(cache=True, nogil=True)
 def _grow(
     axes: Any, shifts: Any, fixed: Any, left: Any, priority: Any, scratch: Any,
-    depth0: int, threshold0: Any, cloud_size: int, nodes: Any, owner: Any,
+    depth0: int, floor0: Any, cloud_size: int, nodes: Any, owner: Any,
 ) -> int:  # fmt: skip
     """Fill `nodes` and `owner`; the number of nodes, or -1 if a chain grows too deep.
 
@@ -123,7 +128,7 @@ def _grow(
     waiting = np.empty((2 * 256 + 2, 7), np.int64)
     floors = np.empty(2 * 256 + 2, np.uint64)
     waiting[0] = (0, len(fixed), 0, len(left), depth0, -1, 0)
-    floors[0] = threshold0
+    floors[0] = floor0
     stacked, count = min(len(left), 1), 0
     while stacked:
         stacked -= 1
@@ -143,12 +148,13 @@ def _grow(
             for i in range(begin, end):
                 owner[left[i]] = node
             continue
-        threshold = _select(priority[begin:end], take, floors[stacked], scratch)
+        threshold, spare = _select(priority[begin:end], take, floors[stacked], scratch)
         kept = begin
         for i in range(begin, end):
             index, value = left[i], priority[i]
-            if value <= threshold:
+            if value < threshold or (value == threshold and spare > 0):
                 owner[index] = node
+                spare -= value == threshold
             else:
                 left[kept] = index
                 priority[kept] = value
@@ -183,9 +189,14 @@ def _first_upper(fixed: Any, axis: Any, shift: Any, low: Any, high: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _select(priority: Any, take: Any, floor: Any, scratch: Any) -> Any:
-    """Find the `take`-th smallest priority: all are above `floor` and uniform, so few are looked at twice."""
+    """Find the `take`-th smallest priority, and how many of those that equal it are among the first `take`.
+
+    None is below `floor`, most are uniform, so few are looked at twice.
+    """
     share = (take + 6.0 * np.sqrt(take) + 16.0) / len(priority)
-    room = 18446744073709551616.0 - float(floor)
+    room = 9223372036854775808.0 - float(floor)  # of samples that are no copies
+    if room <= 0.0:
+        room += 9223372036854775808.0
     while True:
         reach = float(floor) + share * room
         limit = np.uint64(18446744073709551615)
@@ -217,4 +228,8 @@ def _select(priority: Any, take: Any, floor: Any, scratch: Any) -> Any:
             low = i
         else:
             break
-    return scratch[wanted]
+    threshold = scratch[wanted]
+    spare = take
+    for i in range(found):
+        spare -= scratch[i] < threshold
+    return threshold, spare

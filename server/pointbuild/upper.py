@@ -1,9 +1,9 @@
-"""The upper tree: up to which priority each of its nodes takes samples.
+"""The upper tree: how many samples each of its nodes takes of every bucket.
 
-A node takes the M smallest priorities in its cell that are above what its parent took. So one number per node says
-it all: a sample of bucket b belongs to the first node on the path from the root whose *threshold* is not below its
-priority, and to the bucket's own tree if it is above them all. Thresholds come from candidates, the samples of small
-priority that the scatter set aside.
+A node takes the M smallest priorities in its cell that its ancestors left. So the *shares* say it all: the samples of a
+bucket in the order of their priorities belong to the root, as many as its share of the bucket is, then to the next node
+on the way down, and at last to the bucket's own tree. They come from candidates, the samples of small priority that
+the scatter set aside. Equal samples have equal priorities and are in one bucket; a share may end between them.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+
+from .priority import COPY
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,8 +36,6 @@ class UpperNode:
     cell : Cell
     subtree, samples : int
         Of the node with its descendants, and of its own cloud.
-    threshold : int
-        Largest priority that it takes.
     """
 
     parent: int
@@ -43,7 +43,6 @@ class UpperNode:
     cell: Cell
     subtree: int
     samples: int
-    threshold: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,14 +54,14 @@ class Upper:
     nodes : list of UpperNode
     parent, half : list of int
         For each bucket the upper node above it, and which half of that cell it is; -1 and 0 for a lone bucket.
-    taken : list of int
-        For each bucket how many of its samples upper nodes take.
+    shares : list of lists of int
+        For each bucket how many of its samples the nodes above it take, from the root down.
     """
 
     nodes: list[UpperNode]
     parent: list[int]
     half: list[int]
-    taken: list[int]
+    shares: list[list[int]]
 
     def above(self, bucket: int) -> list[int]:
         """Upper nodes from the root down to the bucket."""
@@ -76,8 +75,9 @@ class Upper:
 def candidate_limits(plan: Plan, cloud_size: int, slack: float) -> NDArray[np.uint64]:
     """Priorities up to which the samples of each bucket may be taken by the upper tree.
 
-    The expected threshold of a node is T / C of the range, with C the samples of its cell and T those drawn there
-    by LPC equation 1; `slack` is how many standard deviations of T are added.
+    The expected threshold of a node is T / C of the range of samples that are no copies, with C the samples of its cell
+    and T those drawn there by LPC equation 1; `slack` is how many standard deviations of T are added, and how many
+    32nds of T because others are copies.
     """
     limits = np.zeros(len(plan.buckets), np.uint64)
 
@@ -86,8 +86,8 @@ def candidate_limits(plan: Plan, cloud_size: int, slack: float) -> NDArray[np.ui
             limits[cell.buckets[0]] = most
             return
         drawn += cloud_size
-        enough = drawn + slack * math.sqrt(drawn) + 4 * slack
-        most = max(most, min(int(enough / cell.count * 2.0**64), int(ALL)))
+        enough = drawn * (1 + slack / 32) + slack * math.sqrt(drawn) + 4 * slack
+        most = max(most, min(int(enough / cell.count * 2.0**63), int(ALL)))
         for child in cell.children:
             if child is not None:
                 visit(child, drawn * child.count / cell.count, most)
@@ -96,8 +96,8 @@ def candidate_limits(plan: Plan, cloud_size: int, slack: float) -> NDArray[np.ui
     return limits
 
 
-def thresholds(plan: Plan, candidates: Candidates, limits: NDArray[np.uint64], cloud_size: int) -> Upper | None:
-    """Exact thresholds.
+def share_out(plan: Plan, candidates: Candidates, limits: NDArray[np.uint64], cloud_size: int) -> Upper | None:
+    """Say which node takes how many samples.
 
     Parameters
     ----------
@@ -115,10 +115,14 @@ def thresholds(plan: Plan, candidates: Candidates, limits: NDArray[np.uint64], c
     """
     order = np.lexsort((candidates.priority, candidates.bucket))
     priority, bucket = candidates.priority[order], candidates.bucket[order]
+    copy = 1 + np.flatnonzero((priority[1:] == priority[:-1]) & (bucket[1:] == bucket[:-1]))
+    priority[copy] |= COPY
+    order = np.lexsort((priority, bucket))
+    priority = priority[order]
     first = np.searchsorted(bucket, np.arange(len(plan.buckets) + 1))
     count = np.array([entry.count for entry in plan.buckets])
     used = np.zeros(len(plan.buckets), np.int64)  # candidates of each bucket that are taken, in order of priority
-    upper = Upper([], [-1] * len(plan.buckets), [0] * len(plan.buckets), [])
+    upper = Upper([], [-1] * len(plan.buckets), [0] * len(plan.buckets), [[] for _ in plan.buckets])
 
     def visit(cell: Cell, parent: int, half: int) -> bool:
         begin, end = cell.buckets
@@ -129,24 +133,23 @@ def thresholds(plan: Plan, candidates: Candidates, limits: NDArray[np.uint64], c
             upper.half[inside] = [half] * (end - begin)
             return True
         free = np.concatenate([priority[first[b] + used[b] : first[b + 1]] for b in range(begin, end)])
-        if left <= cloud_size:
-            threshold = ALL
-            if len(free) < left:
-                return False
-        else:
-            if len(free) < cloud_size:
-                return False
-            threshold = np.partition(free, cloud_size - 1)[cloud_size - 1]
-            if threshold > limits[inside].min():
-                return False
+        take = min(left, cloud_size)
+        if len(free) < take:
+            return False
+        threshold = np.partition(free, take - 1)[take - 1]
+        if take < left and threshold > limits[inside].min():
+            return False
+        spare = take - int((free < threshold).sum())  # of those at the threshold
         for b in range(begin, end):
-            used[b] = np.searchsorted(priority[first[b] : first[b + 1]], threshold, side="right")
-        node = UpperNode(parent, half, cell, left, min(left, cloud_size), int(threshold))
+            own = priority[first[b] + used[b] : first[b + 1]]
+            below, upto = np.searchsorted(own, threshold), np.searchsorted(own, threshold, side="right")
+            share = int(below) + min(int(upto - below), spare)
+            spare -= share - int(below)
+            used[b] += share
+            upper.shares[b].append(share)
+        node = UpperNode(parent, half, cell, left, take)
         upper.nodes.append(node)
         number = len(upper.nodes) - 1
         return all(visit(child, number, side) for side, child in enumerate(cell.children) if child is not None)
 
-    if not visit(plan.root, -1, 0):
-        return None
-    upper.taken.extend(used.tolist())
-    return upper
+    return upper if visit(plan.root, -1, 0) else None

@@ -28,15 +28,19 @@ class Node:
     path: tuple[int, ...]
 
 
-def partition(xyz: NDArray[np.float64], priority: NDArray[np.uint64], cloud_size: int) -> list[Node]:
-    """All nodes, breadth first."""
-    low, high = xyz.min(axis=0), xyz.max(axis=0)
-    extent = high - low
+def partition(
+    xyz: NDArray[np.float64],
+    low: NDArray[np.float64],
+    extent: NDArray[np.float64],
+    priority: NDArray[np.uint64],
+    cloud_size: int,
+) -> list[Node]:
+    """All nodes, breadth first, of the root box from `low` on; what lies outside is on its face."""
     places = []
     for sample in xyz:
         place = []
         for axis in range(3):
-            part = Fraction(float((sample[axis] - low[axis]) / extent[axis])) if extent[axis] else Fraction(0)
+            part = Fraction(max(float((sample[axis] - low[axis]) / extent[axis]), 0.0)) if extent[axis] else Fraction(0)
             place.append(min(Fraction(int(part * 2**BITS), 2**BITS), 1 - Fraction(1, 2**BITS)))
         places.append(tuple(place))
     order = [int(value) for value in priority]

@@ -13,7 +13,7 @@ from oracles import surfaces
 from pointbuild.cells import BITS, Cells
 from pointbuild.plan import Cell, Plan, make_plan
 from pointbuild.progress import Silent
-from pointbuild.upper import ALL, candidate_limits, thresholds
+from pointbuild.upper import ALL, candidate_limits, share_out
 from pointbuild.work import Crew
 
 if TYPE_CHECKING:
@@ -125,19 +125,19 @@ def test_a_pile_is_one_bucket_however_large() -> None:
     assert [pile.count for pile in piles] == [900]
 
 
-def test_too_few_candidates_are_noticed_and_more_give_the_same_thresholds() -> None:
+def test_too_few_candidates_are_noticed_and_more_give_the_same_shares() -> None:
     from pointbuild.priority import priorities
     from pointbuild.scatter import Candidates
 
     xyz = surfaces.torus(20_000, seed=5).xyz
     cells, plan = plan_of(xyz, 1500)
-    bucket, priority = plan.locate(cells, xyz), priorities(0, len(xyz), 3)
+    bucket, priority = plan.locate(cells, xyz), priorities(xyz.view(np.uint64), 3)
 
-    def found(slack: float) -> list[int] | None:
+    def found(slack: float) -> list[list[int]] | None:
         limits = candidate_limits(plan, 100, slack)
         chosen = priority <= limits[bucket]
-        upper = thresholds(plan, Candidates(priority[chosen], bucket[chosen]), limits, 100)
-        return None if upper is None else [node.threshold for node in upper.nodes]
+        upper = share_out(plan, Candidates(priority[chosen], bucket[chosen]), limits, 100)
+        return None if upper is None else upper.shares
 
     assert found(0.0) is None
     assert found(8.0) is not None
@@ -151,9 +151,9 @@ def test_an_upper_node_may_take_all_that_is_left() -> None:
 
     xyz = surfaces.torus(900, seed=6).xyz
     cells, plan = plan_of(xyz, 30)
-    bucket, priority = plan.locate(cells, xyz), priorities(0, 900, 0)
+    bucket, priority = plan.locate(cells, xyz), priorities(xyz.view(np.uint64), 0)
     limits = np.full(len(plan.buckets), ALL)
-    upper = thresholds(plan, Candidates(priority, bucket), limits, 400)
+    upper = share_out(plan, Candidates(priority, bucket), limits, 400)
     assert upper is not None
     assert sum(node.samples for node in upper.nodes) == 900
-    assert upper.taken == [entry.count for entry in plan.buckets]
+    assert [sum(shares) for shares in upper.shares] == [entry.count for entry in plan.buckets]

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import json
-import os
 import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import fsspec
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from distributed import Client
+from fsspec.implementations.memory import MemoryFileSystem
 from oracles import surfaces
+from support.workers import Dask, environment
 
 from lpc.errors import BuildError
 from lpc.points import PointBatch
@@ -30,8 +28,8 @@ from pointbuild.share import Share
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
 OPTIONS = BuildOptions(cloud_size=128, threads=1, bucket_samples=700, block_samples=2000)
 
 
@@ -48,6 +46,48 @@ class Killing(Silent):
         if self._now == self._stage:
             self._now = ""
             self._kill()
+
+
+class Refusal(Exception):  # noqa: N818, as stores name theirs
+    """Stores have exceptions of their own."""
+
+
+class StrangeStore(MemoryFileSystem):  # type: ignore[misc]
+    """What stores do that folders do not, each of them seen in one."""
+
+    protocol = "strange"
+    store: dict[str, Any] = {}  # noqa: RUF012, as in the class above
+    pseudo_dirs = [""]  # noqa: RUF012
+
+    @classmethod
+    def _strip_protocol(cls, path: str) -> str:
+        return str(super()._strip_protocol(path.removeprefix("strange://")))
+
+    def cat_file(self, path: str, version: str | None = None, start: Any = None, end: Any = None) -> bytes:
+        """Arguments in another order, as in s3fs."""
+        if version is not None:
+            raise Refusal("a version is a text")
+        return bytes(super().cat_file(path, start=start, end=end))
+
+    def mkdir(self, path: str, create_parents: bool = True, **_: Any) -> None:
+        """A bucket is made of any name."""
+        bucket = self._strip_protocol(path).split("/")[1]
+        if bucket != "kept" and not create_parents:
+            raise Refusal("no such bucket")
+
+    def mv(self, *_: Any, **__: Any) -> None:
+        """Nothing is renamed."""
+        raise Refusal("nothing can be moved")
+
+    def _open(self, path: str, mode: str = "rb", **more: Any) -> Any:
+        if "forbidden" in path:
+            raise Refusal("access\ndenied")
+        return super()._open(path, mode, **more)
+
+
+@pytest.fixture(autouse=True)
+def _strange() -> None:
+    fsspec.register_implementation("strange", StrangeStore, clobber=True)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +107,7 @@ def made(points: PointBatch, out: Path, workers: Cluster | None, progress: Any =
     return out.read_bytes()
 
 
-@pytest.mark.parametrize("url", [None, "memory://share", "file"])
+@pytest.mark.parametrize("url", [None, "memory://share", "strange://kept/share", "file"])
 def test_any_executor_and_share_give_the_same_bytes(
     url: str | None, points: PointBatch, reference: bytes, tmp_path: Path
 ) -> None:
@@ -78,6 +118,7 @@ def test_any_executor_and_share_give_the_same_bytes(
         workers = Cluster(executor, 4, f"file://{folder}" if url == "file" else url)
         assert made(points, tmp_path / "m.lpc", workers) == reference
     assert not fsspec.filesystem("memory").find("/share")
+    assert not StrangeStore.store
     assert not list(folder.iterdir())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["m.lpc", "shared"]
 
@@ -120,6 +161,17 @@ def test_workers_that_do_not_reach_the_share_say_so(tmp_path: Path) -> None:
 def test_a_share_of_an_unknown_kind_is_one_sentence(points: PointBatch, tmp_path: Path) -> None:
     with ThreadPoolExecutor(1) as executor, pytest.raises(BuildError, match="nosuchstore"):
         made(points, tmp_path / "m.lpc", Cluster(executor, 2, "nosuchstore://bucket"))
+
+
+@pytest.mark.parametrize(
+    ("url", "why"), [("strange://misspelt/share", "no such bucket"), ("strange://kept/forbidden", "access denied")]
+)
+def test_what_a_store_refuses_is_one_sentence(url: str, why: str, points: PointBatch, tmp_path: Path) -> None:
+    with ThreadPoolExecutor(1) as executor, pytest.raises(BuildError, match=why) as refusal:
+        made(points, tmp_path / "m.lpc", Cluster(executor, 2, url))
+    assert "\n" not in str(refusal.value)
+    assert not StrangeStore.store
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_command_says_when_no_scheduler_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -177,46 +229,6 @@ def test_a_builder_killed_in_the_middle_goes_on(stage: str, points: PointBatch, 
     assert "going on with the build that was stopped" in told[0]
     assert out.read_bytes() == (tmp_path / "plain.lpc").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["m.lpc", "plain.lpc", "scan.npz"]
-
-
-def environment() -> dict[str, str]:
-    rooms = [str(ROOT / room) for room in ("common", "server", "client")]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(rooms)}
-
-
-class Dask:
-    """A scheduler and two workers of one thread, each a process."""
-
-    def __init__(self, folder: Path, stack: ExitStack) -> None:
-        self._stack = stack
-        self._file = folder / "scheduler.json"
-        options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(self._file)]
-        self._start("dask_scheduler", *options)
-        while not (self._file.exists() and self._file.read_text().endswith("}")):
-            time.sleep(0.02)
-        self.workers = [self._worker(folder / str(number)) for number in range(2)]
-        with Client(self.address, set_as_default=False) as client:
-            client.wait_for_workers(2)
-
-    @property
-    def address(self) -> str:
-        return str(json.loads(self._file.read_text())["address"])
-
-    def _worker(self, folder: Path) -> subprocess.Popen[bytes]:
-        options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--memory-limit", "0"]
-        options += ["--local-directory", str(folder), "--scheduler-file", str(self._file)]
-        return self._start("dask_worker", *options)
-
-    def _start(self, program: str, *options: str) -> subprocess.Popen[bytes]:
-        process = subprocess.Popen(
-            [sys.executable, "-m", f"distributed.cli.{program}", *options],
-            env=environment(),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        self._stack.callback(process.wait)
-        self._stack.callback(process.kill)
-        return process
 
 
 @pytest.fixture

@@ -81,6 +81,25 @@ def test_how_samples_are_cut_into_scans_leaves_no_trace(points: PointBatch, refe
     assert made(scans, tmp_path / "m.lpc", bucket_samples=1000) == reference
 
 
+@pytest.mark.parametrize("options", [{}, {"normals": "drop", "attributes": ()}])
+def test_the_order_of_the_input_leaves_no_trace(options: dict[str, Any], points: PointBatch, tmp_path: Path) -> None:
+    """Without attributes many samples are equal."""
+    out, bare = tmp_path / "m.lpc", PointBatch(points.xyz) if options else points
+    reference = made([ArrayScan(bare)], out)
+    for order in (np.arange(len(bare))[::-1], np.random.default_rng(1).permutation(len(bare))):
+        half = len(bare) // 3
+        scans = [ArrayScan(bare.take(order[:half])), ArrayScan(bare.take(order[half:]))]
+        assert made(scans, out, bucket_samples=900, block_samples=1111, threads=2) == reference
+
+
+def test_the_order_of_a_larger_input_leaves_no_trace_in_the_estimated_spacing(tmp_path: Path) -> None:
+    points = surfaces.bumpy(90_000, seed=3, color=True)
+    out = tmp_path / "m.lpc"
+    reference = made([ArrayScan(points)], out, cloud_size=2048)
+    mixed = points.take(np.random.default_rng(1).permutation(len(points)))
+    assert made([Unsteady(mixed, [20_000, 1, 7777])], out, cloud_size=2048, threads=2) == reference
+
+
 def test_memory_leaves_no_trace(points: PointBatch, reference: bytes, tmp_path: Path) -> None:
     assert made([ArrayScan(points)], tmp_path / "m.lpc", memory_bytes=8 << 30, threads=2) == reference
 

@@ -14,17 +14,34 @@ from oracles import surfaces
 from oracles.partition import partition
 from support.built import Built, build_points, numbered
 
+from lpc.lattice import quantise
+from lpc.points import PointBatch
 from pointbuild.priority import priorities
+from pointbuild.rows import fill_rows, row_dtype
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
 
+    from lpc.header import Header
+
+
+def placed(
+    xyz: NDArray[np.float64], header: Header, seed: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.uint64]]:
+    """Lattice points of the samples that a model was built from, corner and sides of its box, and priorities."""
+    places = quantise(xyz, np.array(header.origin), header.step).astype(np.float64)
+    dtype = row_dtype(header.attributes, short=places.max() < 2**31)
+    values = {"place": np.arange(len(xyz), dtype=np.uint32)}
+    low, high = xyz.min(axis=0), xyz.max(axis=0)
+    priority = fill_rows(dtype, places, values, header.attributes, seed)["priority"]
+    return places, (low - np.array(header.origin)) / header.step, (high - low) / header.step, priority
+
 
 def check(xyz: NDArray[np.float64], built: Built, cloud_size: int, seed: int = 0) -> None:
     """Compare with the oracle, node by node in the order of the file."""
-    expected = partition(xyz, priorities(0, len(xyz), seed), cloud_size)
+    expected = partition(*placed(xyz, built.header, seed), cloud_size)
     assert built.members() == [node.own for node in expected]
     assert built.index.level.tolist() == [node.depth for node in expected]
     assert built.index.subtree.tolist() == [len(node.subtree) for node in expected]
@@ -85,10 +102,9 @@ def test_every_sample_is_in_one_cloud_and_inner_clouds_are_full(count: int, tmp_
 
 def test_a_node_takes_smaller_priorities_than_all_below_it(tmp_path: Path) -> None:
     count = 5000
-    built = build_points(
-        numbered(surfaces.torus(count).xyz), tmp_path / "m.lpc", cloud_size=50, seed=9, bucket_samples=600
-    )
-    priority = priorities(0, count, 9)
+    xyz = surfaces.torus(count).xyz
+    built = build_points(numbered(xyz), tmp_path / "m.lpc", cloud_size=50, seed=9, bucket_samples=600)
+    priority = placed(xyz, built.header, 9)[-1]
     largest = [priority[sorted(own)].max() for own in built.members()]
     smallest = [priority[sorted(own)].min() for own in built.members()]
     for node in range(1, len(largest)):
@@ -109,13 +125,35 @@ def test_children_halve_their_parents_cell(tmp_path: Path) -> None:
     assert both > 50
 
 
+def words(count: int) -> NDArray[np.uint64]:
+    return np.stack([np.arange(count, dtype=np.uint64) % np.uint64(317), np.arange(count, dtype=np.uint64)], axis=1)
+
+
 def test_close_seeds_give_unrelated_subsamples() -> None:
-    chosen = [set(np.argsort(priorities(0, 100_000, seed))[:1000].tolist()) for seed in (0, 1, 2, 3, -1)]
+    chosen = [set(np.argsort(priorities(words(100_000), seed))[:1000].tolist()) for seed in (0, 1, 2, 3, -1)]
     for first, second in pairwise(chosen):
         assert len(first & second) < 40  # 10 expected
 
 
-def test_priorities_do_not_depend_on_where_a_block_begins() -> None:
-    whole = priorities(0, 1000, 5)
-    assert np.array_equal(whole[300:700], priorities(300, 400, 5))
+def test_priorities_do_not_depend_on_where_a_sample_stands() -> None:
+    whole = priorities(words(1000), 5)
+    assert np.array_equal(whole[300:700], priorities(words(1000)[300:700], 5))
     assert len(np.unique(whole)) == 1000
+
+
+def test_samples_next_to_each_other_have_unrelated_priorities() -> None:
+    whole = priorities(words(100_000), 5) >> np.uint64(53)
+    counts = np.bincount(whole.astype(int), minlength=1024)
+    assert ((counts - counts.mean()) ** 2 / counts.mean()).sum() < 1024 + 6 * np.sqrt(2 * 1024)  # chi squared
+
+
+@pytest.mark.parametrize("bucket", [256, 100_000])
+def test_copies_of_a_sample_come_after_everything_else(bucket: int, tmp_path: Path) -> None:
+    """On a coarse lattice many samples without attributes are equal; a place is shown again when all places are."""
+    xyz = surfaces.bumpy(6000, seed=8).xyz
+    built = build_points(PointBatch(xyz), tmp_path / "m.lpc", cloud_size=32, bucket_samples=bucket, position_error=0.04)
+    different = len(np.unique(quantise(xyz, np.array(built.header.origin), built.header.step), axis=0))
+    assert different < 0.7 * len(xyz)
+    for level in range(4):
+        shown = np.concatenate([built.clouds[node].xyz for node in np.flatnonzero(built.index.level <= level)])
+        assert len(np.unique(shown, axis=0)) == len(shown), level

@@ -55,6 +55,22 @@ def test_a_pile_in_a_bucket_of_its_own_leaves_no_trace(
     assert (apart.index.samples == 65535).any()
 
 
+@pytest.mark.parametrize("kinds", [1, 3])
+def test_a_pile_of_equal_samples_is_sorted_on_disk_as_any(
+    kinds: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Their priorities are equal, so no slice of priorities is small."""
+    monkeypatch.setattr(pointbuild.pile, "CHUNK", 999)
+    surface = surfaces.bumpy(3000, seed=1, color=True)
+    pile = PointBatch.concatenate([surface.take(slice(0, kinds))] * (90_000 // kinds))
+    pile.xyz[:] = surface.xyz[0]
+    points = PointBatch.concatenate([surface, pile])
+    points = points.take(RNG.permutation(len(points)))
+    apart = build_points(points, tmp_path / "a.lpc", cloud_size=64, bucket_samples=800)
+    together = build_points(points, tmp_path / "b.lpc", cloud_size=64, bucket_samples=1 << 20)
+    assert apart.data == together.data
+
+
 def test_more_than_a_chain_can_hold_is_said_before_the_work() -> None:
     most = 65535 * 256
     pointbuild.pile.check_piles([Bucket(0, 10**9), Bucket(3, most, coincident=True)])

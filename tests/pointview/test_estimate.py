@@ -44,6 +44,12 @@ def test_a_view_that_sees_nothing_costs_the_first_request(model_file, tmp_path, 
     assert found["bytes"] == min(65536, model_file.stat().st_size)
 
 
+def test_it_says_what_it_does_not_know(model_file, capsys):
+    assert "hidden" in estimate(capsys, model_file)["left_out"]["occlusion"]
+    assert command(["estimate", str(model_file), "--link", "adsl"]) == 0
+    assert "what is hidden" in capsys.readouterr().out
+
+
 def test_a_finer_tolerance_costs_more(model_file, capsys):
     costs = [estimate(capsys, model_file, "--tolerance", t)["bytes"] for t in (8.0, 2.0, 0.5)]
     assert costs == sorted(costs)

@@ -47,10 +47,10 @@ def test_a_still_camera_comes_to_rest(cost, start):
 
 @given(cost=costs, start=st.floats(1.0, COARSEST))
 def test_what_was_too_slow_never_comes_back_under_a_still_camera(cost, start):
-    _, tolerances = run(cost, Feedback(tolerance=start), 100)
+    feedback, tolerances = run(cost, Feedback(tolerance=start), 100)
     too_slow = 0.0
     for tolerance in tolerances[:-1]:
-        assert tolerance > too_slow or tolerance == COARSEST
+        assert tolerance > too_slow or tolerance in (COARSEST, feedback.worth)
         if cost(tolerance) > 1.15 * ALLOWED:
             too_slow = max(too_slow, tolerance)
 
@@ -62,6 +62,27 @@ def test_frames_end_within_the_allowed_time_and_use_it(scale, start):
     end = tolerances[-1]
     assert cost(end) <= 1.15 * ALLOWED or end == COARSEST
     assert end == 1.0 or cost(end) >= 0.6 * ALLOWED
+
+
+@given(fill=st.floats(1.3, 40.0), samples=st.floats(0.0, 0.3), start=st.floats(1.0, 6.0))
+def test_where_pixels_take_the_time_the_picture_stays_fine(fill, samples, start):
+    """Large splats on one another: coarser is no quicker, so nothing is given away for it."""
+
+    def cost(tolerance):
+        return ALLOWED * (fill + samples / tolerance**2)
+
+    feedback, tolerances = run(cost, Feedback(tolerance=start), 60)
+    assert max(tolerances) <= start * 1.5 * 1.5 * 1.4
+    assert tolerances[-1] == pytest.approx(start, rel=1e-6)
+    assert len(set(tolerances[-40:])) == 1
+    _, tolerances = run(cost, feedback, 30, moved=True)
+    assert max(tolerances) <= start * 3.0
+
+
+def test_a_moving_camera_may_get_coarser_again_once_samples_take_the_time():
+    feedback, _ = run(lambda _: 5 * ALLOWED, Feedback(tolerance=2.0), 30, moved=True)
+    _, tolerances = run(smooth(80 * ALLOWED), feedback, 200, moved=True)
+    assert smooth(80 * ALLOWED)(tolerances[-1]) < 1.3 * ALLOWED
 
 
 @given(noise=st.lists(st.floats(0.5, 2.0), min_size=200, max_size=200))

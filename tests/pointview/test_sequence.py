@@ -51,7 +51,7 @@ def test_a_path_becomes_numbered_pictures_and_a_film(model_file, tmp_path, capsy
 
 def test_a_turntable_of_blended_and_of_antialiased_pictures(model_file, tmp_path, capsys):
     shown = []
-    for options in ((), ("--splat", "blended"), ("--antialias", 2)):
+    for options in ((), ("--splat", "disc"), ("--antialias", 2)):
         render(capsys, model_file, tmp_path / "o.png", "--turntable", 2, "--animation", "none", *options)
         shown.append(np.asarray(Image.open(tmp_path / "o-0002.png")).tobytes())
     assert len(set(shown)) == 3

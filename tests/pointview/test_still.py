@@ -40,7 +40,16 @@ def test_a_picture_and_its_figures(model_file, tmp_path):
     result = run(model_file, out, "--size", "200x120", "--json")
     assert result.exit_code == 0, result.output
     report = json.loads(result.stdout)
-    assert list(report) == ["backend", "splats", "clouds", "starved_clouds", "culled", "frame_ms", "bytes_read"]
+    assert list(report) == [
+        "backend",
+        "splats",
+        "clouds",
+        "starved_clouds",
+        "culled",
+        "frame_ms",
+        "bytes_read",
+        "left_out",
+    ]
     assert set(report["culled"]) == {"frustum", "backface", "occluded"}
     assert report["starved_clouds"] == 0
     assert report["splats"] > 1000
@@ -75,6 +84,8 @@ def test_kinds_of_splats_and_samples_a_pixel(model_file, tmp_path):
         pictures.append(np.asarray(Image.open(out)))
     assert all(picture.shape == (60, 80, 3) for picture in pictures)
     assert len({picture.tobytes() for picture in pictures}) == len(pictures)
+    assert run(model_file, tmp_path / "a.png", "--size", "80x60", "--tolerance", "3").exit_code == 0
+    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "a.png")), pictures[3])
     refused = run(model_file, tmp_path / "a.png", "--size", "9000x10", "--antialias", "2")
     assert refused.exit_code == 2
     assert "above 16384 pixels" in refused.output
@@ -205,6 +216,7 @@ def test_what_is_hidden_is_not_drawn(tmp_path):
     options = StillOptions(width=200, height=200, style=Style(two_sided=True), tolerance=2.0)
     seen, whole = (asyncio.run(draw_still(str(path), replace(options, occlusion=on))) for on in (True, False))
     assert seen.report["culled"]["occluded"] > 0
+    assert seen.report["left_out"] == {}
     assert seen.report["splats"] < 0.6 * whole.report["splats"]
     covered = (seen.frame.node >= 0) | (whole.frame.node >= 0)
     assert (seen.frame.rgb != whole.frame.rgb).any(axis=2)[covered].mean() < 0.002

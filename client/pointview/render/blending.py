@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    InParallel = Callable[[Callable[[int], None]], None]
+    InParallel = Callable[[Callable[[int], None]], object]
 
 CHUNK = 1 << 20
 """Samples at a time, 40 bytes each."""

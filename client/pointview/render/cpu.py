@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from lpc.header import Header
     from pointview.camera import Camera
     from pointview.refine import Cut
+
+Result = TypeVar("Result")
 
 FIRST_SAMPLES = 1 << 21
 """Room at the start, samples."""
@@ -70,7 +72,7 @@ class CpuBackend:
         rgb, depth = np.empty((*shape, 3), dtype=np.uint8), np.empty(shape, dtype=np.float32)
         node, side = np.empty(shape, dtype=np.int32), np.empty(shape, dtype=np.float32)
         starved = np.empty(shape, dtype=bool)
-        source = np.empty(shape, dtype=np.int32)
+        holes, sources = np.empty(depth.size, dtype=np.int32), np.empty(depth.size, dtype=np.int32)
         surface = (255, 255, 255) if self._packer.has_colors else style.surface
         albedo = np.array(surface, dtype=np.float32) / np.float32(255)
         background = np.array(style.background, dtype=np.uint8)
@@ -94,20 +96,21 @@ class CpuBackend:
             strength = style.edl_strength * camera.focal
             picture_kernels.eye_dome(rgb, depth, side, *rows(worker), strength, shading.NEIGHBOUR, shading.DARKEST)
 
-        def close(worker: int) -> None:
+        def find(worker: int) -> slice:
             largest = min(splats.LARGEST_HOLE, math.ceil(splats.HOLE * side.max()))
-            picture_kernels.close_holes(
-                depth, side, source, *rows(worker), camera.focal, splats.HOLE, largest, splats.WALLS
+            top, bottom = rows(worker)
+            found = picture_kernels.close_holes(
+                depth, side, holes, sources, top, bottom, camera.focal, splats.HOLE, largest, splats.WALLS
             )
+            return slice(top * camera.width, top * camera.width + found)
 
         self._in_parallel(splat)
         self._in_parallel(resolve)
         if style.close_holes:
-            self._in_parallel(close)
-            holes = np.flatnonzero(source != np.arange(source.size, dtype=np.int32).reshape(shape))
-            walls = source.ravel()[holes]
+            found = self._in_parallel(find)
+            into, out_of = (np.concatenate([pixels[part] for part in found]) for pixels in (holes, sources))
             for image in (rgb.reshape(-1, 3), depth.ravel(), node.ravel(), side.ravel(), starved.ravel()):
-                image[holes] = image[walls]
+                image[into] = image[out_of]
         if style.splat == "blended":
             linear = linear_light()
 
@@ -193,12 +196,10 @@ class CpuBackend:
         light["lit"], light["two_sided"] = self._packer.has_normals, style.two_sided
         return light
 
-    def _in_parallel(self, work: Callable[[int], None]) -> None:
+    def _in_parallel(self, work: Callable[[int], Result]) -> list[Result]:
         """Call `work(worker)` once for every worker; the first on this thread."""
         others = [] if self._pool is None else [self._pool.submit(work, worker) for worker in range(1, self._threads)]
-        work(0)
-        for other in others:
-            other.result()
+        return [work(0), *(other.result() for other in others)]
 
 
 def _grown(array: NDArray[Any], rows: int) -> NDArray[Any]:

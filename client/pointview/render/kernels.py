@@ -16,7 +16,6 @@ import numba
 import numpy as np
 
 from .rules import EMPTY, F, direction, plane_of, spacing_at, x_of, y_of, z_of
-from .tables import HALVING, PLACE  # noqa: F401  (`seen` looks for them here)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -62,14 +61,15 @@ def resolve(
     bright, shine = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
     here, across = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
     for row in range(top, bottom):
-        nearest[:] = layers[0, row * width : (row + 1) * width]
-        for layer in range(1, len(layers)):
-            other = layers[layer, row * width : (row + 1) * width]
-            for column in range(width):
-                nearest[column] = min(nearest[column], other[column])
-        depth[row], node[row], side[row], starved[row] = np.inf, -1, 0.0, False
-        for channel in range(3):
-            rgb[row, :, channel] = background[channel]
+        for column in range(width):
+            key = layers[0, row * width + column]
+            for layer in range(1, len(layers)):
+                key = min(key, layers[layer, row * width + column])
+            nearest[column] = key
+            depth[row, column], node[row, column], side[row, column] = np.inf, -1, 0.0
+            starved[row, column] = False
+            for channel in range(3):
+                rgb[row, column, channel] = background[channel]
         count = 0
         for column in range(width):
             column_of[count] = column
@@ -94,9 +94,8 @@ def resolve(
             across[k] = spacing
             node[row, column_of[k]], starved[row, column_of[k]] = cloud.node, hungry
         _measure(here[:count], across, x, y, z, rotation, view)
-        for k in range(count):
-            if across[k] > view.round_from and view.oriented and code[k] != 0:
-                here[k] = _depth_of_disc(code[k], x[k], y[k], z[k], here[k], row, column_of[k], rotation, view)
+        if view.oriented:
+            _meet(here[:count], across, code, x, y, z, row, column_of, rotation, view)
         _light_up(bright[:count], shine, code, x, y, z, light)
         for k in range(count):
             column = column_of[k]
@@ -126,24 +125,30 @@ def _measure(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def _depth_of_disc(
-    code: int,
-    x: np.float32,
-    y: np.float32,
-    z: np.float32,
-    here: np.float32,
+def _meet(
+    here: NDArray[np.float32],
+    across: NDArray[np.float32],
+    code: NDArray[np.int32],
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    z: NDArray[np.float32],
     row: int,
-    column: int,
+    column: NDArray[np.int32],
     rotation: NDArray[np.float32],
     view: Any,
-) -> np.float32:  # pragma: no cover - compiled
-    """Depth at which a pixel's ray meets the plane of a disc."""
-    right = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
-    up = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
-    nx, ny, nz = plane_of(code, right, up, here, rotation, view.steepest)
-    ray_x = (F(column) + F(0.5) - view.width * F(0.5)) / view.focal
+) -> None:  # pragma: no cover - compiled
+    """Where samples are discs, write the depths at which their pixels' rays meet their planes."""
     ray_y = (view.height * F(0.5) - F(row) - F(0.5)) / view.focal
-    return F((nx * right + ny * up + nz * here) / (nx * ray_x + ny * ray_y + nz))
+    middle_x, focal, round_from, steepest = view.width * F(0.5), view.focal, view.round_from, view.steepest
+    r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
+    r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
+    for k in range(len(here)):
+        right = r00 * x[k] + r01 * y[k] + r02 * z[k]
+        up = r10 * x[k] + r11 * y[k] + r12 * z[k]
+        nx, ny, nz = plane_of(code[k], right, up, here[k], rotation, steepest)
+        ray_x = (F(column[k]) + F(0.5) - middle_x) / focal
+        depth = (nx * right + ny * up + nz * here[k]) / (nx * ray_x + ny * ray_y + nz)
+        here[k] = depth if (across[k] > round_from) & (code[k] != 0) else here[k]
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -161,7 +166,8 @@ def _light_up(
         for k in range(len(bright)):
             bright[k], shine[k] = _lit(code[k], x[k], y[k], z[k], light)
     else:
-        bright[:], shine[:] = F(1.0), F(0.0)
+        for k in range(len(bright)):
+            bright[k], shine[k] = F(1.0), F(0.0)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

@@ -72,29 +72,36 @@ def eye_dome(
 def close_holes(
     depth: NDArray[np.float32],
     side: NDArray[np.float32],
-    source: NDArray[np.int32],
+    holes: NDArray[np.int32],
+    sources: NDArray[np.int32],
     top: int,
     bottom: int,
     focal: float,
     reach: float,
     largest: int,
     walls: int,
-) -> None:  # pragma: no cover - compiled
-    """Say for each pixel of the rows `top` to `bottom` which pixel it shows: itself, or the wall of the hole it is in.
+) -> int:  # pragma: no cover - compiled
+    """Find the pixels of the rows `top` to `bottom` that lie in holes, and the walls that they show instead.
 
     Parameters
     ----------
     depth, side : (h, w) float32
-    source : (h, w) int32
-        Result: row * width + column.
+    holes, sources : (h * w,) int32
+        Results from `top * width` on, each `row * width + column`.
     reach : float
         A wall is at most this many sides of its own splat away.
     largest : int
         And at most this many pixels.
     walls : int
         Directions, of eight, in which a hole has walls.
+
+    Returns
+    -------
+    int
+        How many pixels.
     """
     height, width = depth.shape
+    first = count = top * width
     for row in range(top, bottom):
         for column in range(width):
             here = depth[row, column]
@@ -117,7 +124,10 @@ def close_holes(
                                 nearest, best = step, y * width + x
                             break
                     step += 1 if step < 4 else step // 2
-            source[row, column] = best if found >= walls else row * width + column
+            if found >= walls:
+                holes[count], sources[count] = row * width + column, best
+                count += 1
+    return count - first
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

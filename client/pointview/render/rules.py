@@ -60,9 +60,14 @@ def direction(code: int | np.int32) -> tuple[np.float32, np.float32, np.float32]
     return u, v, w
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@numba.njit(nogil=True, cache=True, inline="always")
 def plane_of(
-    code: int, right: np.float32, up: np.float32, depth: np.float32, rotation: NDArray[np.float32], steepest: np.float32
+    code: int | np.int32,
+    right: np.float32,
+    up: np.float32,
+    depth: np.float32,
+    rotation: NDArray[np.float32],
+    steepest: np.float32,
 ) -> tuple[np.float32, np.float32, np.float32]:  # pragma: no cover - compiled
     """Return a disc's normal in camera space: toward the eye, and seen no more from the side than `steepest`."""
     a, b, c = direction(code)
@@ -73,8 +78,7 @@ def plane_of(
     vx, vy, vz = right * away, up * away, depth * away
     length = F(1.0) / math.sqrt(nx * nx + ny * ny + nz * nz)
     facing = -(nx * vx + ny * vy + nz * vz) * length
-    if facing < F(0.0):
-        length, facing = -length, -facing
+    length, facing = (-length, -facing) if facing < F(0.0) else (length, facing)
     lean = max(steepest - facing, F(0.0))
     nx, ny, nz = nx * length - lean * vx, ny * length - lean * vy, nz * length - lean * vz
     length = F(1.0) / math.sqrt(nx * nx + ny * ny + nz * nz)

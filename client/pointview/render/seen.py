@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import kernels, picture_kernels
+from . import picture_kernels
+from .tables import HALVING, PLACE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -18,11 +19,11 @@ if TYPE_CHECKING:
 def place_table(cut: Cut) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return a cut's places as the kernels read them: of the nodes, and the halvings of the levels."""
     if cut.places is None:
-        return np.empty(0, dtype=kernels.PLACE), np.empty(0, dtype=kernels.HALVING)
-    places = np.empty(len(cut.places.link), dtype=kernels.PLACE)
+        return np.empty(0, dtype=PLACE), np.empty(0, dtype=HALVING)
+    places = np.empty(len(cut.places.link), dtype=PLACE)
     places["lower"], places["upper"] = cut.places.link.T
     places["lower_spacing"], places["upper_spacing"] = cut.places.spacing.T
-    halvings = np.empty(len(cut.places.axis), dtype=kernels.HALVING)
+    halvings = np.empty(len(cut.places.axis), dtype=HALVING)
     halvings["axis"], halvings["half"] = cut.places.axis, cut.places.half
     return places, halvings
 

@@ -41,38 +41,89 @@ def padded(height: int, width: int) -> int:
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def _lean(
+    nx: NDArray[np.float32],
+    ny: NDArray[np.float32],
+    nz: NDArray[np.float32],
+    rights: NDArray[np.float32],
+    ups: NDArray[np.float32],
+    words: NDArray[np.uint64],
+    depths: NDArray[np.float32],
+    cloud: Any,
+    rotation: NDArray[np.float32],
+    view: Any,
+) -> None:  # pragma: no cover - compiled
+    """Place samples and their planes in camera space; see `_project` for why apart."""
+    ox, oy, oz, scale, steepest = cloud.x, cloud.y, cloud.z, cloud.scale, view.steepest
+    for i in range(len(words)):
+        word = words[i]
+        x, y, z = ox + scale * x_of(word), oy + scale * y_of(word), oz + scale * z_of(word)
+        right = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
+        up = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
+        code = np.int32(word >> np.uint64(48))
+        nx[i], ny[i], nz[i] = plane_of(code, right, up, depths[i], rotation, steepest)
+        rights[i], ups[i] = right, up
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _bound(
+    first: NDArray[np.int32],
+    end: NDArray[np.int32],
+    at: NDArray[np.float32],
+    aside: NDArray[np.float32],
+    along: NDArray[np.float32],
+    nz: NDArray[np.float32],
+    depths: NDArray[np.float32],
+    sides: NDArray[np.float32],
+    words: NDArray[np.uint64],
+    sign: np.float32,
+    size: np.float32,
+    view: Any,
+) -> None:  # pragma: no cover - compiled
+    """Bounds of the pictures of discs along one axis of the picture; empty for what is not drawn as one."""
+    focal, round_from, round_half, oriented = view.focal, view.round_from, view.round * F(0.5), view.oriented
+    for i in range(len(words)):
+        half, depth, slope = sides[i] * round_half, depths[i], aside[i] / depths[i]
+        drawn = (sides[i] > round_from) & (at[i] + half >= F(0.0)) & (at[i] - half < size)
+        # Of a tilted disc: right to first order in radius over depth, and no less.
+        radius = half * depth / focal
+        across = radius * focal / depth / (F(1.0) - min(radius / depth, F(0.5)))
+        lean = along[i] - slope * nz[i]
+        reach = across * math.sqrt(max(F(1.0) + slope * slope - lean * lean, F(0.0)))
+        tilted = oriented & (words[i] >> np.uint64(48) != np.uint64(0))
+        middle = size * F(0.5) + sign * (slope * focal) if tilted else at[i]
+        reach = reach if tilted else half
+        low, high = max(np.ceil(middle - reach - F(0.5)), F(0.0)), min(np.ceil(middle + reach - F(0.5)), size)
+        drawn = drawn & (low < high)
+        first[i] = np.int32(low) if drawn else np.int32(0)
+        end[i] = np.int32(high) if drawn else np.int32(0)
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
 def _disc(
     keys: NDArray[np.uint64],
     block: NDArray[np.uint64],
+    bits: np.int32,
     place: int,
-    right: np.float32,
-    up: np.float32,
-    depth: np.float32,
+    box: tuple[np.int32, np.int32, np.int32, np.int32],
+    center: tuple[np.float32, np.float32, np.float32],
     radius: np.float32,
     normal: tuple[np.float32, np.float32, np.float32],
     view: Any,
 ) -> None:  # pragma: no cover - compiled
     """Draw a disc in the plane of its normal, exactly: each pixel's ray meets the plane inside the radius, or not."""
+    left, end, top, bottom = box
+    right, up, depth = center
     nx, ny, nz = normal
-    middle_x, middle_y, focal = view.width * F(0.5), view.height * F(0.5), view.focal
-    slope_x, slope_y = right / depth, up / depth
-    # Bounds of the disc's picture: right to first order in radius over depth, and no less.
-    across = radius * focal / depth / (F(1.0) - min(radius / depth, F(0.5)))
-    half_x = across * math.sqrt(max(F(1.0) + slope_x * slope_x - (nx - slope_x * nz) ** 2, F(0.0)))
-    half_y = across * math.sqrt(max(F(1.0) + slope_y * slope_y - (ny - slope_y * nz) ** 2, F(0.0)))
-    px, py = middle_x + slope_x * focal, middle_y - slope_y * focal
-    left = np.int32(max(np.ceil(px - half_x - F(0.5)), F(0.0)))
-    end = np.int32(min(np.ceil(px + half_x - F(0.5)), view.width))
-    top = np.int32(max(np.ceil(py - half_y - F(0.5)), F(0.0)))
-    bottom = np.int32(min(np.ceil(py + half_y - F(0.5)), view.height))
-    reach, inverse = radius * radius, F(1.0) / focal
+    middle_x, middle_y = view.width * F(0.5), view.height * F(0.5)
+    reach, inverse = radius * radius, F(1.0) / view.focal
     bulge = view.bulge / radius
     along = nx * right + ny * up + nz * depth
-    bits = _block_bits(int(end - left))
     for upper in range(top, bottom, BLOCK >> bits):
         for near in range(left, end, 1 << bits):
             for k in range(BLOCK):
-                row, column = upper + (np.int32(k) >> bits), near + (np.int32(k) & ((np.int32(1) << bits) - 1))
+                row = np.int32(upper) + (np.int32(k) >> bits)
+                column = np.int32(near) + (np.int32(k) & ((np.int32(1) << bits) - np.int32(1)))
                 ray_y = (middle_y - F(row) - F(0.5)) * inverse
                 ray_x = (F(column) + F(0.5) - middle_x) * inverse
                 t = along / (nx * ray_x + (ny * ray_y + nz))
@@ -80,14 +131,16 @@ def _disc(
                 apart = dx * dx + dy * dy + dz * dz
                 covered = (apart <= reach) & (t > F(0.0)) & (column < end) & (row < bottom)
                 block[k] = key_of(t + bulge * apart, place) if covered else EMPTY
-            _write(keys, int(view.width), upper, near, bits, block)
+            _write(keys, block, bits, np.int32(view.width), np.int32(upper), np.int32(near))
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@numba.njit(nogil=True, cache=True, inline="always")
 def _ball(
     keys: NDArray[np.uint64],
     block: NDArray[np.uint64],
+    bits: np.int32,
     place: int,
+    box: tuple[np.int32, np.int32, np.int32, np.int32],
     px: np.float32,
     py: np.float32,
     depth: np.float32,
@@ -95,39 +148,30 @@ def _ball(
     view: Any,
 ) -> None:  # pragma: no cover - compiled
     """Draw a disc that faces the eye and bulges toward it, so that of two the one with the nearer centre is seen."""
-    left = np.int32(max(np.ceil(px - half - F(0.5)), F(0.0)))
-    end = np.int32(min(np.ceil(px + half - F(0.5)), view.width))
-    top = np.int32(max(np.ceil(py - half - F(0.5)), F(0.0)))
-    bottom = np.int32(min(np.ceil(py + half - F(0.5)), view.height))
+    left, end, top, bottom = box
     reach = half * half
     bulge = view.bulge * depth / (view.focal * half)
-    bits = _block_bits(int(end - left))
     for upper in range(top, bottom, BLOCK >> bits):
         for near in range(left, end, 1 << bits):
             for k in range(BLOCK):
-                row, column = upper + (np.int32(k) >> bits), near + (np.int32(k) & ((np.int32(1) << bits) - 1))
-                dy = F(row) + F(0.5) - py
-                dx = F(column) + F(0.5) - px
+                row = np.int32(upper) + (np.int32(k) >> bits)
+                column = np.int32(near) + (np.int32(k) & ((np.int32(1) << bits) - np.int32(1)))
+                dx, dy = F(column) + F(0.5) - px, F(row) + F(0.5) - py
                 apart = dx * dx + dy * dy
                 covered = (apart <= reach) & (column < end) & (row < bottom)
                 block[k] = key_of(depth + bulge * apart, place) if covered else EMPTY
-            _write(keys, int(view.width), upper, near, bits, block)
+            _write(keys, block, bits, np.int32(view.width), np.int32(upper), np.int32(near))
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
-def _block_bits(columns: int) -> np.int32:  # pragma: no cover - compiled
-    """Logarithm of the width of the blocks in which a disc of so many columns is drawn: 4, 8 or 16."""
-    return np.int32(2) if columns <= 4 else (np.int32(3) if columns <= 8 else np.int32(4))
-
-
-@numba.njit(nogil=True, cache=True, error_model="numpy")
 def _write(
-    keys: NDArray[np.uint64], width: int, top: int, left: int, bits: np.int32, block: NDArray[np.uint64]
+    keys: NDArray[np.uint64], block: NDArray[np.uint64], bits: np.int32, width: np.int32, top: np.int32, left: np.int32
 ) -> None:  # pragma: no cover - compiled
     """Keep the smaller of the keys in a block of pixels and those there."""
     start = top * width + left
     for k in range(BLOCK):
-        spot = np.uint32(start + (k >> bits) * width + (k & ((1 << bits) - 1)))
+        down, across = np.int32(k) >> bits, np.int32(k) & ((np.int32(1) << bits) - np.int32(1))
+        spot = np.uint32(start + down * width + across)
         keys[spot] = min(keys[spot], block[k])
 
 
@@ -218,7 +262,9 @@ def _fill(
     is always written, as the minimum; and small squares of unlike size are all filled as the largest of them, with a
     key that changes nothing beside them.
     """
-    widest, highest = columns.max(), rows.max()
+    widest, highest = np.int32(0), np.int32(0)
+    for i in range(len(rows)):
+        widest, highest = max(widest, columns[i]), max(highest, rows[i])
     if highest == 0:
         return
     if widest > LANES or highest > LANES:
@@ -256,7 +302,7 @@ def splat(
     Parameters
     ----------
     keys : (h * w + padding,) uint64
-        EMPTY, or what earlier calls left; see `key_images`.
+        EMPTY, or what earlier calls left; see `padded`.
     words : (n,) uint64
         x, y, z, normal: 16 bits each, the first in the lowest.
     clouds : (k,) CLOUD
@@ -272,6 +318,9 @@ def splat(
     depths, sides = np.empty(BATCH, dtype=np.float32), np.empty(BATCH, dtype=np.float32)
     left, top = np.empty(BATCH, dtype=np.int32), np.empty(BATCH, dtype=np.int32)
     columns, rows = np.empty(BATCH, dtype=np.int32), np.empty(BATCH, dtype=np.int32)
+    nx, ny = np.empty(BATCH, dtype=np.float32), np.empty(BATCH, dtype=np.float32)
+    nz, rights = np.empty(BATCH, dtype=np.float32), np.empty(BATCH, dtype=np.float32)
+    ups = np.empty(BATCH, dtype=np.float32)
     block = np.empty(BLOCK, dtype=np.uint64)
     for c in range(len(clouds)):
         cloud = clouds[c]
@@ -289,21 +338,27 @@ def splat(
                         sides[i] = min(spacing * view.closing * (F(1.0) / depths[i]), view.largest)
             _box(left, top, columns, rows, px[:count], py, sides, view)
             _fill(keys, int(width), int(place), depths, left, top, columns[:count], rows[:count])
-            if not sides[:count].max() > round_from:
-                continue
+            widest = F(0.0)
             for i in range(count):
-                half = sides[i] * round_half
-                if not (sides[i] > round_from and px[i] + half >= F(0.0) and py[i] + half >= F(0.0)
-                        and px[i] - half < width and py[i] - half < height):  # fmt: skip
+                widest = max(widest, sides[i])
+            if not widest > round_from:
+                continue
+            if view.oriented:
+                _lean(nx, ny, nz, rights, ups, batch, depths, cloud, rotation, view)
+            _bound(left, columns, px, rights, nx, nz, depths, sides, batch, F(1.0), width, view)
+            _bound(top, rows, py, ups, ny, nz, depths, sides, batch, F(-1.0), height, view)
+            for i in range(count):
+                box = (left[i], columns[i], top[i], rows[i])
+                if box[0] >= box[1] or box[2] >= box[3]:
                     continue
-                code = int(batch[i] >> np.uint64(48))
-                if view.oriented and code != 0:
-                    x = cloud.x + cloud.scale * x_of(batch[i])
-                    y = cloud.y + cloud.scale * y_of(batch[i])
-                    z = cloud.z + cloud.scale * z_of(batch[i])
-                    right = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
-                    up = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
-                    normal = plane_of(code, right, up, depths[i], rotation, view.steepest)
-                    _disc(keys, block, place + i, right, up, depths[i], half * depths[i] / view.focal, normal, view)
+                half, across = sides[i] * round_half, box[1] - box[0]
+                bits = np.int32(3) if across <= 8 else np.int32(4)
+                if not (view.oriented and batch[i] >> np.uint64(48) != 0):
+                    _ball(keys, block, bits, place + i, box, px[i], py[i], depths[i], half, view)
+                    continue
+                center, normal = (rights[i], ups[i], depths[i]), (nx[i], ny[i], nz[i])
+                radius = half * depths[i] / view.focal
+                if across <= 4:  # most of them: compiled apart, so that nothing in its loops depends on the size
+                    _disc(keys, block, np.int32(2), place + i, box, center, radius, normal, view)
                 else:
-                    _ball(keys, block, place + i, px[i], py[i], depths[i], half, view)
+                    _disc(keys, block, bits, place + i, box, center, radius, normal, view)

@@ -124,7 +124,7 @@ def stream(
     if result.speculative_bytes:
         click.echo(f"fetched ahead   {result.speculative_bytes:,} bytes, {result.wasted_bytes:,} of them never drawn")
     if result.occlusion == "auto":
-        click.echo(f"hidden          {result.occlusion_note or f'{result.occluded:,} branches left out'}")
+        click.echo(f"hidden          {result.left_out.get('occlusion') or f'{result.occluded:,} branches left out'}")
     click.echo(f"report          {written[0]}")
 
 

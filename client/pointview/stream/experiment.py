@@ -202,7 +202,7 @@ def _report(
         occlusion=experiment.occlusion,
         prefetch=experiment.prefetch,
         occluded=recording.occluded,
-        occlusion_note=recording.occlusion_note,
+        left_out=recording.left_out,
         size=experiment.size,
         seconds=experiment.seconds,
         samples=recording.samples,

@@ -37,7 +37,7 @@ class Report:
     occlusion: str
     prefetch: str
     occluded: int
-    occlusion_note: str | None
+    left_out: dict[str, str]
     size: tuple[int, int]
     seconds: float
     samples: int

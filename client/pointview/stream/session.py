@@ -154,8 +154,8 @@ class Recording:
         Samples resident at the end: those that were received, unless the capacity of the layer was too small.
     occluded : int
         Branches that the last cut left out because they are hidden.
-    occlusion_note : str or None
-        Why occlusion culling was off at the end.
+    left_out : dict of str to str
+        What of the viewer's means paused at the end, and why.
     header : Header, optional
         Of the model that was there at the end.
     """
@@ -168,7 +168,7 @@ class Recording:
     longest_frame_s: float = 0.0
     samples: int = 0
     occluded: int = 0
-    occlusion_note: str | None = None
+    left_out: dict[str, str] = field(default_factory=dict)
     header: Header | None = None
 
 
@@ -343,7 +343,7 @@ class _Session:
     def _moment(self, cut: Cut, camera: Camera, frame: Frame, t: float, stats: LayerStats) -> Moment:
         """Note the state that a picture was drawn from."""
         self.recording.occluded = cut.culled.occluded
-        self.recording.occlusion_note = None if self.occlusion is None else self.occlusion.verdict
+        self.recording.left_out = {} if self.occlusion is None else self.occlusion.left_out
         return Moment(
             t=t,
             stats=stats,

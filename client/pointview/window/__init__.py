@@ -2,6 +2,7 @@
 
     controls   camera motions as pure functions
     inputs     what a person did in a frame, and what that does to the view; the table of keys
+    commands   what keys, drops and pastes command besides
     keyboard   keys that went down, with their modifiers
     settings   what the panel edits
     recorder   views in time, as a PATH.json

@@ -47,6 +47,9 @@ if TYPE_CHECKING:
 TICK = 1 / 60
 """Seconds between two looks at the wants."""
 
+CLOSING_TICK = 0.1
+"""Seconds between two looks at whether to stop."""
+
 MOST_NEWS = 512
 """News that one frame takes in: a fast disk must not turn a frame into an upload of everything."""
 
@@ -181,7 +184,7 @@ class Feed:
         feeding = asyncio.ensure_future(self._feed())
         try:
             while not (self._closing or feeding.done()):
-                await asyncio.wait([feeding], timeout=TICK)
+                await asyncio.wait([feeding], timeout=CLOSING_TICK)
             if feeding.done():
                 feeding.result()
         finally:

@@ -37,7 +37,7 @@ class Keyboard:
 
     def __init__(self, window: Any, renderer: Any) -> None:
         self._renderer = renderer
-        self._pressed: set[str] = set()
+        self._pressed: list[str] = []
         self._down: dict[int, str] = {}
         self._shift = False
         glfw.set_key_callback(window, self._on_key)
@@ -46,12 +46,15 @@ class Keyboard:
     def take(self, *, heard: bool) -> tuple[frozenset[str], frozenset[str]]:
         """Return keys that went down since the last call, and keys that are down or were.
 
+        A key that went down twice is there again at the next call.
+
         Parameters
         ----------
         heard : bool
             False while a field of the panel takes the letters.
         """
-        pressed, self._pressed = frozenset(self._pressed), set()
+        once = next((at for at, key in enumerate(self._pressed) if key in self._pressed[:at]), len(self._pressed))
+        pressed, self._pressed = frozenset(self._pressed[:once]), self._pressed[once:]
         if not heard:
             return frozenset(), frozenset()
         return pressed, pressed | set(self._down.values()) | ({"shift"} if self._shift else set())
@@ -64,12 +67,12 @@ class Keyboard:
         elif action == glfw.PRESS and not mods & OTHERS:
             name = SPECIAL.get(key) or glfw.get_key_name(key, scancode) or ""
             if mods & glfw.MOD_CONTROL:
-                self._pressed.update({COMMANDS[name]} if name in COMMANDS else ())
+                self._pressed.extend([COMMANDS[name]] if name in COMMANDS else [])
             elif name and name not in SYMBOLS:
-                self._pressed.add(name)
+                self._pressed.append(name)
                 self._down[key] = name
 
     def _on_char(self, window: Any, code: int) -> None:
         self._renderer.char_callback(window, code)
         if chr(code) in SYMBOLS:
-            self._pressed.add(chr(code))
+            self._pressed.append(chr(code))

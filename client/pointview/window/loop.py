@@ -26,6 +26,8 @@ class SessionReport:
         Frames of the window, and those among them that drew the model anew.
     longest_frame_ms : float
         From collected input to the swapped buffers, but for the first picture, which compiles and loads.
+    longest_beside_ms : float
+        Longest time of a frame beside refining and drawing: input, news, panel, swap.
     first_picture_s : float or None
         Seconds from the start of the loop to the first samples on the screen.
     longest_handover_ms : float
@@ -41,6 +43,7 @@ class SessionReport:
     frames: int
     pictures: int
     longest_frame_ms: float
+    longest_beside_ms: float
     first_picture_s: float | None
     longest_handover_ms: float
     splats: int
@@ -67,7 +70,7 @@ def run_loop(
     """
     panel = Panel()
     frames = pictures = 0
-    longest, first_picture = 0.0, None
+    longest, beside, first_picture = 0.0, 0.0, None
     start = clock()
     while not (screen.closing or viewer.closing):
         screen.wait(busy=viewer.busy)
@@ -88,6 +91,7 @@ def run_loop(
         frames += 1
         if first_picture is not None:
             longest = max(longest, ended - began)
+            beside = max(beside, ended - began - (0.0 if picture is None else viewer.drawing))
         elif viewer.frame is not None and viewer.frame.clouds:
             first_picture = ended - start
         if seconds is not None and ended - start >= seconds:
@@ -98,6 +102,7 @@ def run_loop(
         frames=frames,
         pictures=pictures,
         longest_frame_ms=round(1e3 * longest, 2),
+        longest_beside_ms=round(1e3 * beside, 2),
         first_picture_s=None if first_picture is None else round(first_picture, 3),
         longest_handover_ms=round(1e3 * handover, 3),
         splats=0 if viewer.frame is None else viewer.frame.splats,

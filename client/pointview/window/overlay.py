@@ -76,8 +76,8 @@ class Overlay:
             self._legend(colouring.legend, unit_of(crs) if colouring.mode == "height" else "")
         if viewer.recorder is not None:
             self._recording(viewer.recorder.seconds)
-        if viewer.message or viewer.trouble:
-            self._message(viewer.message or viewer.trouble)
+        if viewer.message:
+            self._message(viewer.message)
         if viewer.loading:
             self._load_bar(*viewer.loaded)
 
@@ -88,10 +88,11 @@ class Overlay:
         for axis in sorted(range(3), key=lambda axis: -forward[axis]):
             name, color = AXES[axis]
             tip = (x + arm * float(right[axis]), y - arm * float(up[axis]))
+            self.draw.add_line((x, y), tip, _packed(SHADE), self.letter / 3)
             self.draw.add_line((x, y), tip, _packed(color), self.letter / 7)
             size = imgui.calc_text_size(name)
             beyond = (x + 1.35 * arm * float(right[axis]), y - 1.35 * arm * float(up[axis]))
-            self.draw.add_text((beyond[0] - size.x / 2, beyond[1] - size.y / 2), _packed(color), name)
+            self._text(beyond[0] - size.x / 2, beyond[1] - size.y / 2, name, color)
 
     def _scale_bar(self, view: Viewpoint, unit: str) -> None:
         """Draw a tidy length as it is seen at the pivot."""
@@ -177,11 +178,11 @@ class Overlay:
         text = f"{written_bytes(here)} of {written_bytes(whole)}"
         self._text(self.left + width / 2 - imgui.calc_text_size(text).x / 2, top - 1.3 * self.letter, text)
 
-    def _text(self, x: float, y: float, text: str) -> None:
+    def _text(self, x: float, y: float, text: str, color: tuple[int, ...] = TEXT) -> None:
         """Write on whatever colour."""
         for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
             self.draw.add_text((x + dx, y + dy), _packed(SHADE), text)
-        self.draw.add_text((x, y), _packed(TEXT), text)
+        self.draw.add_text((x, y), _packed(color), text)
 
     def _box(self, left: float, top: float, right: float, bottom: float) -> None:
         self.draw.add_rect_filled((left, top), (right, bottom), _packed(SHADE, 210), self.letter / 4)

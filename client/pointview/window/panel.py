@@ -30,6 +30,9 @@ MODE_NAMES: dict[Mode, str] = {
     "classification": "classification", "normal": "normals", "level": "level of the tree",
 }  # fmt: skip
 
+ROOM = 1.3
+"""Widths of the panel that a window must have for the panel to be shown at all."""
+
 SPLATS: tuple[Splat, ...] = get_args(Splat)
 SPLAT_NAMES: dict[str, str] = {
     "disc": "discs in the surface", "round": "discs", "square": "squares", "blended": "blended surface",
@@ -56,11 +59,11 @@ class Panel:
     def draw(self, viewer: Viewer, renderer: str) -> None:
         """Write one frame of it."""
         self.commands = frozenset()
-        settings = viewer.settings
-        if settings.panel:
+        settings, window = viewer.settings, imgui.get_io().display_size.x / imgui.get_font_size()
+        if settings.panel and window >= ROOM * WIDTH:
             self._settings(viewer, renderer)
         if settings.help:
-            _help(settings, self.inset(settings, imgui.get_io().display_size.x / imgui.get_font_size()))
+            _help(settings, self.inset(settings, window))
 
     def _settings(self, viewer: Viewer, renderer: str) -> None:
         letter, flags = imgui.get_font_size(), imgui.WindowFlags_

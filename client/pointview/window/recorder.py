@@ -33,11 +33,14 @@ class Recorder:
     seconds: float = 0.0
     entries: list[dict[str, Any]] = field(default_factory=list)
 
-    def note(self, now: float, camera: Camera) -> None:
-        """Add the view of a frame, unless the last entry is too young."""
+    def note(self, now: float, camera: Camera, *, last: bool = False) -> None:
+        """Add the view of a frame, unless the last entry is too young; the last one takes its place."""
         t = max(0.0, round(now - self.start, 3))
         self.seconds = t
-        if not self.entries or t - self.entries[-1]["t"] >= APART:
+        young = bool(self.entries) and t - self.entries[-1]["t"] < APART
+        if young and last and len(self.entries) > 1:
+            self.entries.pop()
+        if not young or last:
             self.entries.append({"t": t, **camera.to_view()})
 
     def write(self, path: Path) -> None:

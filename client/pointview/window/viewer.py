@@ -7,15 +7,12 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import unquote
 
 import numpy as np
 
-from lpc.errors import LpcError
 from pointview.camera import Camera
-from pointview.colouring import MODES, available_modes
-from pointview.render.picture import save_picture
 
+from .commands import obey
 from .controls import Viewpoint, vertical_of
 from .culling import Culling
 from .feed import View
@@ -23,8 +20,7 @@ from .inputs import Inputs, Scene, moved
 from .mirror import Mirror
 from .painter import Painter, shown
 from .quality import Quality, loaded_bytes
-from .recorder import Recorder, free_name
-from .settings import TOLERANCES, Settings
+from .recorder import Recorder
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -35,6 +31,7 @@ if TYPE_CHECKING:
     from pointview.render import Frame, Kind
 
     from .feed import Feed
+    from .settings import Settings
 
 REST = 0.25
 """Seconds without motion after which the camera rests and the picture may take longer."""
@@ -44,8 +41,6 @@ SHARE_EVERY = 0.5
 
 NOTICE = 8.0
 """Seconds that a notice is shown."""
-
-SCANS = (".ply", ".las", ".laz", ".e57", ".pcd", ".xyz", ".csv", ".txt", ".pts", ".ptx", ".obj")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,12 +104,13 @@ class Viewer:
         self._drawn: tuple[object, ...] = ()
         self._moved_at = self._share_at = self._turned_at = self._told_at = -1e9
         self._redraw = False
+        self._errors: dict[str, int] = {}
 
     def open(self, target: str) -> None:
         """Show another model in place of the present one."""
         self._close_feed()
         self.mirror, self.view, self.cut, self.frame, self.scene = Mirror(), None, None, None, None
-        self.message, self.loaded = "", (0, 0)
+        self.message, self.loaded, self._errors = "", (0, 0), {}
         self.settings.up, self.settings.help = None, False
         self.feed = self._open_feed(target)
 
@@ -122,6 +118,10 @@ class Viewer:
         """Stop what was started."""
         self._close_feed()
         self.painter.close()
+
+    def tell(self, text: str) -> None:
+        """Show a notice for a while."""
+        self.message, self._told_at = text, self._clock()
 
     @property
     def title(self) -> str:
@@ -135,11 +135,14 @@ class Viewer:
             return self.settings.up
         return "y" if self.mirror.index is None or self.mirror.header.crs is None else "z"
 
-    @property
-    def trouble(self) -> str:
-        """What keeps data from coming, in a line; empty if nothing does."""
-        stats = None if self.feed is None else self.feed.stats
-        return stats.errors[0].text if stats is not None and stats.errors else ""
+    def toggle_recording(self) -> Recorder | None:
+        """Start to record the path of the camera, or stop; return what was recorded."""
+        recorder, self.recorder = self.recorder, None
+        if recorder is None:
+            self.recorder = Recorder(self._clock())
+        elif self.view is not None:
+            recorder.note(self._clock(), self.view.camera, last=True)
+        return recorder
 
     @property
     def loading(self) -> bool:
@@ -162,12 +165,13 @@ class Viewer:
         now = self._clock()
         if now - self._told_at > NOTICE and not self.mirror.failure:
             self.message = ""
-        self._obey(did)
+        obey(self, did)
         if self.feed is None:
             return None
         news = self.mirror.take_in(self.feed.news())
         if self.mirror.failure:
             self.message = self.mirror.failure
+        self._hear(self.feed)
         if self.mirror.index is None:
             return None
         self._place(did, now)
@@ -186,6 +190,15 @@ class Viewer:
             self._share_at = now
             self.loaded = loaded_bytes(self.mirror, self.view.camera, self.settings, self.culling.hidden)
         return picture
+
+    def _hear(self, feed: Feed) -> None:
+        """Show what keeps data from coming, each time that it happens."""
+        errors = () if feed.stats is None else feed.stats.errors
+        counts = {error.text: error.count for error in errors}
+        new = [text for text, count in counts.items() if count > self._errors.get(text, 0)]
+        if new:
+            self.tell(new[-1])
+        self._errors = counts
 
     def _draw(self, *, moving: bool) -> NDArray[np.uint8] | None:
         assert self.view is not None
@@ -249,93 +262,11 @@ class Viewer:
             return Camera.from_view(self.options.view, width=width, height=height)
         return Camera.frame_model(self.mirror.header, width=width, height=height, z_up=self.up == "z")
 
-    def _obey(self, did: Inputs) -> None:
-        """Do what keys and drops command besides moving the camera."""
-        settings = self.settings
-        for target in map(tidied, did.dropped[:1]):
-            if target.lower().endswith(SCANS):
-                name = Path(target).name
-                self._tell(f"{name} is a scan: make a model of it with `pointstream build {name} -o MODEL.lpc`")
-            else:
-                self.open(target)
-        for key in did.pressed:
-            if key == "c":
-                modes = MODES if self.mirror.index is None else available_modes(self.mirror.header)
-                at = modes.index(settings.mode) if settings.mode in modes else 0
-                settings.mode = modes[(at + 1) % len(modes)]
-            elif key == "t":
-                settings.tint = not settings.tint
-            elif key == "g":
-                settings.fly = not settings.fly
-            elif key == "b":
-                settings.limited = not settings.limited
-            elif key in ("[", "]"):
-                finer = settings.tolerance * (0.8 if key == "[" else 1.25)
-                settings.tolerance = min(max(finer, TOLERANCES[0]), TOLERANCES[1])
-            elif key == "tab":
-                settings.panel = not settings.panel
-            elif key in ("f1", "?"):
-                settings.help = not settings.help
-            elif key == "escape":
-                settings.help = False
-            elif key in ("p", "f12"):
-                self.save_picture()
-            elif key == "r":
-                self.toggle_recording()
-            elif key == "u":
-                settings.up = "z" if self.up == "y" else "y"
-            elif key == "quit":
-                self.closing = True
-
-    def save_picture(self) -> None:
-        """Write the picture without the panel to the first free name."""
-        if self.frame is None:
-            return
-        path = free_name(self.options.folder, self._stem, ".png")
-        self._try(lambda: save_picture(shown(self.frame, self.settings), path) if self.frame else None, path)
-
-    def toggle_recording(self) -> None:
-        """Start to record the path of the camera, or write what was recorded."""
-        if self.recorder is None:
-            self.recorder = Recorder(self._clock())
-            return
-        recorder, self.recorder = self.recorder, None
-        if recorder.entries:
-            path = free_name(self.options.folder, f"{self._stem}-path", ".json")
-            self._try(lambda: recorder.write(path), path)
-
-    @property
-    def _stem(self) -> str:
-        name = "" if self.feed is None else self.feed.target.rstrip("/").rpartition("/")[2].partition("?")[0]
-        return Path(name).stem or "model"
-
-    def _try(self, write: Callable[[], None], path: Path) -> None:
-        try:
-            write()
-        except LpcError as error:
-            self._tell(str(error))
-        else:
-            self._tell(f"written: {path}")
-
-    def _tell(self, text: str) -> None:
-        """Show a notice for a while."""
-        self.message, self._told_at = text, self._clock()
-
     def _close_feed(self) -> None:
         if self.feed is not None:
             self.feed.close()
             self.longest_handover = max(self.longest_handover, self.feed.longest_handover)
             self.feed = None
-
-
-def tidied(target: str) -> str:
-    """Return the path or address in what was dropped or pasted: its first line, without quotes, of a file: address."""
-    line = target.strip().partition("\n")[0].strip()
-    if len(line) > 1 and line[0] == line[-1] and line[0] in "'\"":
-        line = line[1:-1]
-    if line.startswith("file://"):
-        return unquote(line.removeprefix("file://").removeprefix("localhost"))
-    return line
 
 
 def _look(settings: Settings) -> tuple[object, ...]:

@@ -19,7 +19,7 @@ CONTRACT = [
     "curve",
 ]  # fmt: skip
 EXTRA = [
-    "model", "priority", "splat_rule", "occlusion", "occluded", "occlusion_note", "prefetch",
+    "model", "priority", "splat_rule", "occlusion", "occluded", "left_out", "prefetch",
     "speculative_bytes", "idle_bytes", "wasted_bytes",
     "size", "seconds", "model_samples", "model_bytes", "payload_bytes", "wanted_s",
     "frames", "errors",

@@ -67,7 +67,9 @@ def test_the_line_carries_payload_while_anything_is_wanted(endless, tmp_path):
     assert report["settled_s"] is None
     assert 12.9 < report["wanted_s"] <= 13.0
     assert 0.95 <= report["link_utilisation"] <= 1.0
-    assert report["link_utilisation"] == pytest.approx(report["payload_bytes"] / (1.25e6 / 8 * report["wanted_s"]))
+    assert report["link_utilisation"] == pytest.approx(
+        (report["payload_bytes"] - report["idle_bytes"]) / (1.25e6 / 8 * report["wanted_s"])
+    )
     assert report["payload_bytes"] <= report["bytes"] <= 13.0 * 1.25e6 / 8
     assert report["first_picture_s"] <= 0.6
     assert report["curve"][-1]["psnr_db"] > report["curve"][5]["psnr_db"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,14 +14,16 @@ from support.display import until
 
 from lpc.points import PointBatch
 from pointview.camera import Camera
-from pointview.occlusion import KEPT
+from pointview.occlusion import KEPT, Occlusion
 from pointview.refine import refine
 from pointview.render import open_backend
+from pointview.window.commands import tidied
+from pointview.window.culling import STRIDE
 from pointview.window.inputs import Inputs
 from pointview.window.mirror import Came, Failed, Opened
 from pointview.window.painter import Painter
 from pointview.window.settings import Settings
-from pointview.window.viewer import Viewer, ViewerOptions, tidied
+from pointview.window.viewer import Viewer, ViewerOptions
 
 SIZE = (160, 160)
 VIEW = {"eye": [0.4, -2.5, 1.0], "target": [0, 0, 0], "up": [0, 0, 1], "fov_y": 45.0}
@@ -160,11 +163,37 @@ def test_a_moving_camera_shows_in_the_frame_what_was_hidden(session, onion):
     assert worst < 0.005
 
 
+@pytest.mark.parametrize(("cost", "asked"), [(0.001, 12), (0.018, 6), (0.5, 4)])
+def test_tests_keep_to_their_share_of_moving_frames(session, monkeypatch, cost, asked):
+    one = session()
+    one.rest()
+    looks, look, draw = [], Occlusion.look, Painter.draw
+
+    def slow_look(*arguments, **options):
+        looks.append(options["stride"])
+        one.now += cost
+        return look(*arguments, **options) and 0  # no third pass
+
+    def slow_draw(*arguments):
+        one.now += 0.1
+        return draw(*arguments)
+
+    monkeypatch.setattr(Occlusion, "look", slow_look)
+    monkeypatch.setattr(Painter, "draw", slow_draw)
+    one.frame(turned=(2.0, 0.0))
+    looks.clear()
+    for _ in range(12):
+        one.frame(turned=(2.0, 0.0))
+    assert looks == [STRIDE] * asked
+    one.rest()
+    assert looks[-1] == 1
+
+
 def test_the_budget_counts_what_is_seen(session, onion):
-    one = session(limited=True, budget=6000)
+    one = session(limited=True, budget=10_500, tolerance=1.0)
     one.rest()
     assert one.viewer.cut.culled.occluded > 0
-    assert 6000 - 2 * onion.header.cloud_size <= one.viewer.cut.splats <= 6000
+    assert 10_500 - 2 * onion.header.cloud_size <= one.viewer.cut.splats <= 10_500
 
 
 def test_culling_is_switched_off_and_on(session):
@@ -208,6 +237,19 @@ def test_a_model_that_fails_is_a_message_and_the_next_one_is_shown(session, onio
     one.rest()
     assert one.viewer.message == ""
     assert one.viewer.frame.splats > 0
+
+
+def test_what_keeps_data_from_coming_is_said_each_time_and_then_forgotten(session):
+    one = session()
+    one.rest()
+    for count, now in ((1, 100.0), (2, 200.0)):
+        one.feed.stats = SimpleNamespace(errors=(SimpleNamespace(text="host: down", count=count),))
+        one.now = now
+        one.frame()
+        assert one.viewer.message == "host: down"
+        one.now = now + 50.0
+        one.frame()
+        assert one.viewer.message == ""
 
 
 def test_the_first_view_is_the_asked_one(session):

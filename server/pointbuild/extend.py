@@ -1,0 +1,377 @@
+"""Adding scans to a model: its samples once more as a scan, and its clouds for those that do not change.
+
+A model is made of the lattice points and codes of its samples (`frame`), so what is decoded from it serves as well as
+what it was built of: the model of these samples and of others is, byte for byte, the one that all scans together give
+on the same lattice. Each of its samples brings the number of the cloud it was in. A cloud of the new model whose
+samples are all those of one old cloud, and no others, is that cloud, and its bytes are copied if what they are guessed
+from did not change either (`lpc.context`).
+"""
+
+from __future__ import annotations
+
+import os
+import zlib
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lpc.codec import decode_cloud, near_box, samples_to_points
+from lpc.context import ANCESTORS, has_context, with_ancestors
+from lpc.errors import BuildError, FormatError
+from lpc.header import HEADER_PROBE, parse_header
+from lpc.index import IndexTree
+from lpc.points import PointBatch
+
+from .readers import ScanInfo
+from .readers.scan import DEFAULT_ATTRIBUTES
+from .work import in_order
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from lpc.cloud import Cloud
+    from lpc.header import Header
+
+    from .frame import Frame
+    from .inputs import Inputs
+    from .options import BuildOptions
+    from .survey import Survey
+
+OWNER = "\0cloud"
+"""Name of the column that says which cloud of the old model a sample was in, counted from 1; 0: it is new."""
+
+DECODERS = 2
+"""Threads that decode the old model."""
+
+PACKING = "packing"
+"""Header key: the options of a build that only its bytes would tell, and that an append needs."""
+
+
+def packing_of(options: BuildOptions) -> dict[str, Any]:
+    """Value of the header's `PACKING`."""
+    return {"effort": options.effort, "color_bits": options.color_bits}
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """Turn what is wrong with a file into a sentence about it."""
+    try:
+        yield
+    except FormatError as error:
+        raise BuildError(f"{path} cannot be added to: {error}") from error
+    except OSError as error:
+        raise BuildError(f"{path}: {error.strerror or error}; name a model that can be read") from error
+
+
+@dataclass(frozen=True, slots=True)
+class OldModel:
+    """A model that scans are added to.
+
+    Parameters
+    ----------
+    path : Path
+    header : Header
+    index : IndexTree
+        Whole.
+    """
+
+    path: Path
+    header: Header
+    index: IndexTree
+
+    @classmethod
+    def open(cls, path: Path) -> OldModel:
+        """Read the header and the index.
+
+        Raises
+        ------
+        BuildError
+            If there is no such model, it is damaged, or it was built by a program that could not add to it.
+        """
+        header = read_header(path)
+        start = np.rint(np.array(header.origin) / header.step)
+        if PACKING not in header.extra or (start * header.step != header.origin).any():
+            raise BuildError(
+                f"{path} was built before models could be added to: build it anew of its scans and the others"
+            )
+        with _told(path), path.open("rb") as file:
+            if os.fstat(file.fileno()).st_size != header.bytes:
+                raise BuildError(f"{path} is not whole: it should have {header.bytes:,} bytes; fetch or copy it again")
+            index = IndexTree(header)
+            for page in range(header.pages):
+                where = index.page_range(page)
+                file.seek(where.start)
+                index.add_page(page, file.read(where.stop - where.start))
+        return cls(path, header, index)
+
+    @property
+    def info(self) -> ScanInfo:
+        """The model as a scan."""
+        header = self.header
+        attributes = {entry.name: np.dtype(entry.dtype) for entry in header.attributes}
+        for name, constant in header.constants.items():
+            attributes[name] = np.dtype(constant.dtype)
+        return ScanInfo(
+            path=self.path,
+            samples_hint=header.samples,
+            bounds_hint=header.bounds,
+            crs=header.crs,
+            attributes=attributes,
+            raw_bytes=header.bytes,
+            left_out=dict(header.left_out),
+        )
+
+    def batches(self, size: int) -> Iterator[PointBatch]:
+        """Yield all samples in the order of the clouds, with `OWNER`.
+
+        A decoded position may lie half a step outside the box of the input; it is given on the box, which is nearest to
+        the same lattice point.
+        """
+        size = max(size // (DECODERS + 2), 1)  # so many runs are here at a time
+        samples = np.cumsum(self.index.samples)
+        cuts = [0]
+        while cuts[-1] < len(samples):
+            reached = samples[cuts[-1] - 1] if cuts[-1] else 0
+            cuts.append(max(int(np.searchsorted(samples, reached + size, side="right")), cuts[-1] + 1))
+        # Decoding takes longer than everything else that reads a scan.
+        with ThreadPoolExecutor(DECODERS, thread_name_prefix="decode") as pool:
+            for _, batch in in_order(lambda run: pool.submit(self._decode, *run), pairwise(cuts), DECODERS):
+                yield batch
+
+    def _decode(self, first: int, stop: int) -> PointBatch:
+        """Give the samples of nodes `first` to `stop - 1`."""
+        header = self.header
+        decoded = self.decoded(np.arange(first, stop))
+        clouds = [decoded[node] for node in range(first, stop)]
+        codes = {
+            entry.name: np.concatenate([cloud.codes[entry.name] for cloud in clouds]) for entry in header.attributes
+        }
+        points = samples_to_points(np.concatenate([cloud.lattice() for cloud in clouds]), codes, header)
+        xyz = np.clip(points.xyz, header.bounds[:3], header.bounds[3:])
+        owner = np.repeat(np.arange(first, stop, dtype=np.uint32) + np.uint32(1), self.index.samples[first:stop])
+        return PointBatch(xyz, {**points.attributes, OWNER: owner})
+
+    def decoded(self, nodes: NDArray[np.int64]) -> dict[int, Cloud]:
+        """Decode clouds and all their ancestors: as many again, where nodes stand side by side in a level."""
+        schema, parent = self.header.attributes, self.index.parent
+        found: dict[int, Cloud] = {}
+        with self.path.open("rb") as file, _told(self.path):
+            wanted = with_ancestors(nodes, parent, len(parent)) if has_context(schema) else nodes
+            for node in wanted.tolist():
+                frame, samples = self.frame(file.fileno(), node), int(self.index.samples[node])
+                context = [found[above] for above in self.line(node)]
+                found[node] = decode_cloud(frame, samples=samples, schema=schema, context=context)
+        return found
+
+    def line(self, node: int) -> list[int]:
+        """Nodes that tell a cloud, from the root down."""
+        if not has_context(self.header.attributes):
+            return []
+        line = [node]
+        while len(line) <= ANCESTORS and (above := int(self.index.parent[line[-1]])) >= 0:
+            line.append(above)
+        return line[:0:-1]
+
+    def frame(self, file: int, node: int) -> bytes:
+        """Bytes of a cloud, checked."""
+        where = self.index.cloud_range(node)
+        data = os.pread(file, where.stop - where.start, where.start)
+        if zlib.crc32(data) != int(self.index.crc[node]):
+            raise BuildError(f"cloud {node} of {self.path} is damaged: `pointstream verify` says what else is")
+        return data
+
+    def options(self, options: BuildOptions) -> BuildOptions:
+        """Give those of a build that adds to this model: what the model is made by is kept."""
+        header = self.header
+        normal = next((entry.bits for entry in header.attributes if entry.kind == "normal"), options.normal_bits)
+        return replace(
+            options,
+            cloud_size=header.cloud_size,
+            step=header.step,
+            position_error=None,
+            seed=header.seed,
+            page_nodes=header.page_nodes,
+            normal_bits=normal,
+            attributes=None if self.info.attributes.keys() <= set(DEFAULT_ATTRIBUTES) else ("all",),
+            **header.extra[PACKING],
+        )
+
+    def join(self, inputs: Inputs) -> Inputs:
+        """Put the model before the scans that are added to it.
+
+        Raises
+        ------
+        BuildError
+            If a scan has other attributes or another coordinate system.
+        """
+        mine = self.info
+        for scan in inputs.scans:
+            for name in mine.attributes.keys() | scan.info.attributes.keys():
+                if name not in scan.info.attributes:
+                    raise BuildError(
+                        f"{scan.info.path} has no attribute {name!r}, and all samples of {self.path} have one: build "
+                        "them anew together, which leaves it out"
+                    )
+                if name not in mine.attributes and name not in mine.left_out:
+                    raise BuildError(
+                        f"{scan.info.path} has an attribute {name!r} that {self.path} lacks: take it out of the scan"
+                    )
+                if name in mine.attributes and mine.attributes[name] != scan.info.attributes[name]:
+                    raise BuildError(
+                        f"{name!r} is {scan.info.attributes[name]} in {scan.info.path} and {mine.attributes[name]} in "
+                        f"{self.path}: convert the scan"
+                    )
+        if inputs.crs != mine.crs:
+            said = "says none" if inputs.crs is None else "is in another one"
+            raise BuildError(
+                f"{self.path} and {inputs.scans[0].info.path} have different coordinate systems (the scan {said}): "
+                "bring the scan into that of the model"
+            )
+        return replace(
+            inputs,
+            scans=(self, *inputs.scans),
+            attributes={name: np.dtype(dtype) for name, dtype in mine.attributes.items()},
+            left_out={**inputs.left_out, **mine.left_out},
+        )
+
+    def join_survey(self, found: Survey) -> Survey:
+        """Add what the model says of its own samples as they came.
+
+        Raises
+        ------
+        BuildError
+            If colours that the model has shortened would be shortened otherwise.
+        """
+        header = self.header
+        for entry in header.attributes:
+            if entry.depth and entry not in found.schema:
+                raise BuildError(
+                    f"the colours of {self.path} have {entry.bits} bits of {entry.depth}, and those of the scans "
+                    "cannot be shortened in the same way: build all anew together"
+                )
+        rejected = dict(header.rejected)
+        for reason, count in found.rejected.items():
+            rejected[reason] = rejected.get(reason, 0) + count
+        return replace(
+            found,
+            low=np.minimum(found.low, header.bounds[:3]),
+            high=np.maximum(found.high, header.bounds[3:]),
+            rejected=rejected,
+        )
+
+    def clouds(self, found: Survey, frame: Frame, options: BuildOptions, generator: str) -> OldClouds | None:
+        """Clouds that may stay as they are; None if every cloud changes: with the origin, or what codes mean."""
+        header = self.header
+        same = (
+            tuple(frame.origin.tolist()) == header.origin
+            and found.schema == header.attributes
+            and header.generator == generator
+            and header.extra[PACKING] == packing_of(options)
+        )
+        return OldClouds(self) if same else None
+
+
+@dataclass(frozen=True, slots=True)
+class OldClouds:
+    """The clouds of the old model, for the new one.
+
+    Parameters
+    ----------
+    model : OldModel
+    """
+
+    model: OldModel
+
+    def copies(
+        self, lattice: NDArray[np.int64], owner: NDArray[np.uint32], bounds: NDArray[np.int64], first: int
+    ) -> Copies:
+        """Find out which clouds may be copied.
+
+        Parameters
+        ----------
+        lattice : ndarray, (n, 3) int64
+        owner : ndarray, (n,) uint32
+            `OWNER` of all samples.
+        bounds : ndarray, (k + 1,) int64
+            Cloud i is the samples ``bounds[i]`` to ``bounds[i + 1]``.
+        first : int
+            Clouds before it are only context.
+        """
+        model, starts = self.model, bounds[:-1]
+        number = owner[starts].astype(np.int64) - 1
+        one = np.minimum.reduceat(owner, starts) == np.maximum.reduceat(owner, starts)
+        found = np.where(one & (number >= 0) & (model.index.samples[number] == np.diff(bounds)), number, -1)
+        found[:first] = -1
+        low, high = np.minimum.reduceat(lattice, starts), np.maximum.reduceat(lattice, starts)
+        context: dict[int, Cloud] = {}
+        if has_context(model.header.attributes):
+            parents = np.unique(model.index.parent[found[found >= 0]]).astype(np.int64)
+            context = model.decoded(parents[parents >= 0])
+        return Copies(model, found, low, high, context)
+
+
+@dataclass(slots=True)
+class Copies:
+    """Clouds of the old model for some of the new one.
+
+    Parameters
+    ----------
+    model : OldModel
+    found : ndarray, (k,) int64
+        Old cloud that has the samples of each, -1: none.
+    low, high : ndarray, (k, 3) int64
+        Boxes of the clouds.
+    context : dict of int to Cloud
+        Old clouds that tell those.
+    count : int
+        Frames given.
+    """
+
+    model: OldModel
+    found: NDArray[np.int64]
+    low: NDArray[np.int64]
+    high: NDArray[np.int64]
+    context: dict[int, Cloud]
+    count: int = 0
+
+    def frame(self, cloud: int, context: Sequence[Cloud]) -> bytes | None:
+        """Bytes of a cloud; None if it is another one, or if its ancestors tell it otherwise."""
+        node = int(self.found[cloud])
+        if node < 0 or not self._tell_the_same(cloud, context):
+            return None
+        self.count += 1
+        with self.model.path.open("rb") as file:
+            return self.model.frame(file.fileno(), node)
+
+    def _tell_the_same(self, cloud: int, context: Sequence[Cloud]) -> bool:
+        """Whether the ancestors have the same samples in the box of a cloud, in the same order."""
+        schema, low, high = self.model.header.attributes, self.low[cloud], self.high[cloud]
+        if not has_context(schema):
+            return True
+        new = near_box(context, schema, low, high)
+        old = near_box([self.context[node] for node in self.model.line(int(self.found[cloud]))], schema, low, high)
+        return (
+            new is not None
+            and old is not None
+            and np.array_equal(new.position, old.position)
+            and np.array_equal(new.rows, old.rows)
+        )
+
+
+def read_header(path: Path) -> Header:
+    """Header of a model.
+
+    Raises
+    ------
+    BuildError
+        If there is none.
+    """
+    with _told(path), path.open("rb") as file:
+        return parse_header(file.read(HEADER_PROBE))
