@@ -258,7 +258,7 @@ def _guess(near: Any, near_rows: Any, position: Any, rows: Any, guessed: Any, nb
     company = np.empty((k, 8), np.uint32)
     _beside(near, position, nbits, company)
     # Who is missing, number n, stands far away and is worth nothing.
-    place = np.empty((n + 1 + k, 4), np.int64)
+    place = np.empty((n + 1 + k, 4), np.int32)
     place[n] = 1 << 30
     values = np.zeros((n + 1 + k, 3 * fields), np.int32)
     for axis in range(3):
@@ -289,7 +289,7 @@ def _guess(near: Any, near_rows: Any, position: Any, rows: Any, guessed: Any, nb
                 member[which] = company[i, which]
             member[8] = own - reach if reach else n
             member[9] = own + reach if reach and i + reach < k else n
-            x, y, z = place[own, 0], place[own, 1], place[own, 2]
+            x, y, z = np.int64(place[own, 0]), np.int64(place[own, 1]), np.int64(place[own, 2])
             for m in range(10):
                 dx, dy, dz = place[member[m], 0] - x, place[member[m], 1] - y, place[member[m], 2] - z
                 distance[m] = np.float64(dx * dx + dy * dy + dz * dz + 1)

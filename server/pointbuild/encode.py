@@ -102,34 +102,50 @@ def encode_run(
     family = with_ancestors(np.arange(first, stop), nodes.parent, ANCESTORS)
     before = len(family) - (stop - first)
     bounds = np.concatenate([[0], np.cumsum(nodes.samples[family])])
-    rows = np.empty(bounds[-1], regions.dtype)
-    at = 0
-    for node in family.tolist():
-        for run in range(nodes.run_start[node], nodes.run_start[node + 1]):
-            count = int(nodes.run_count[run])
-            regions.read(int(nodes.run_first[run]), rows[at : at + count])
-            at += count
-    lattice = rows["xyz"].astype(np.int64)
-    codes = {attribute.name: rows[attribute.name] for attribute in schema}
+    lattice, owner, codes = _read(family, bounds, nodes, regions, schema)
     place = np.searchsorted(family, nodes.parent[family])
     parent = np.where(family[place] == nodes.parent[family], place, -1)
-    copies = None if old is None else old.copies(lattice, rows[OWNER], bounds, before)
+    copies = None if old is None else old.copies(lattice, owner, bounds, before)
     frames = encode_clouds(
         lattice, codes, bounds, schema, parent=parent, first=before, effort=effort,
         known=None if copies is None else copies.frame,
     )  # fmt: skip
     kept = 0 if copies is None else copies.count
     own = int(bounds[before])
-    lattice, rows, bounds = lattice[own:], rows[own:], bounds[before:] - own
+    lattice, bounds = lattice[own:], bounds[before:] - own
     shape = (stop - first, int(nodes.depth[first:stop].max()) + 1)
     reach, spread = np.zeros(shape), np.zeros(shape)
     _reach(lattice, bounds, first, nodes.parent, nodes.depth, geometry.origin, geometry.step, geometry.center, reach)
     for attribute in schema:
         if attribute.kind == "normal":
-            normals = unit_vectors(rows[attribute.name], attribute.bits)
+            normals = unit_vectors(codes[attribute.name][own:], attribute.bits)
             _spread(normals, bounds, first, nodes.parent, nodes.depth, geometry.axis, spread)
     sizes = np.array([len(frame) for frame in frames], np.uint32)
     return Run(first, frames, sizes, np.array([zlib.crc32(frame) for frame in frames], np.uint32), reach, spread, kept)
+
+
+def _read(
+    family: NDArray[np.int64], bounds: NDArray[np.int64], nodes: Nodes, regions: Rows, schema: Schema
+) -> tuple[NDArray[np.int64], NDArray[np.uint32], dict[str, NDArray[Any]]]:
+    """Lattice points, owners and codes of the samples of some nodes; whole rows are here for one run of them only."""
+    names = [attribute.name for attribute in schema]
+    columns = {name: np.empty((bounds[-1], *regions.dtype[name].shape), regions.dtype[name].base) for name in names}
+    lattice = np.empty((bounds[-1], 3), np.int64)
+    owner = np.zeros(bounds[-1], np.uint32)
+    known = OWNER in (regions.dtype.names or ())
+    at = 0
+    for node in family.tolist():
+        for run in range(nodes.run_start[node], nodes.run_start[node + 1]):
+            rows = np.empty(int(nodes.run_count[run]), regions.dtype)
+            regions.read(int(nodes.run_first[run]), rows)
+            to = slice(at, at + len(rows))
+            lattice[to] = rows["xyz"]
+            if known:
+                owner[to] = rows[OWNER]
+            for name in names:
+                columns[name][to] = rows[name]
+            at = to.stop
+    return lattice, owner, columns
 
 
 def kernels_are_loaded() -> bool:
