@@ -114,7 +114,7 @@ def export(
         total = opened.count(**choice)  # type: ignore[arg-type]
         # Counts stand at the head of most formats, so what the bounds cut is counted first.
         count = total if bounds is None else sum(map(len, _batches(opened, "counting", total, choice)))
-        if not count:
+        if bounds is not None and not count:
             spans = ",".join(f"{value:.9g}" for value in header.bounds)
             raise LpcError(f"{model}: no sample that is here is inside the bounds; the whole model spans {spans}")
         target = Target(

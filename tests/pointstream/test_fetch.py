@@ -64,7 +64,9 @@ def test_a_region_is_a_model_that_has_every_sample_of_the_region(model: bytes, t
     assert report.bytes < 0.9 * len(model)
     (tmp_path / "whole.lpc").write_bytes(model)
     with pointstream.open(str(tmp_path / "whole.lpc")) as whole, pointstream.open(str(out)) as part:
-        assert part.info == {**whole.info, "complete": False}
+        here = {"samples": len(part.read()), "clouds": part.info["here"]["clouds"]}
+        assert part.info == {**whole.info, "complete": False, "here": here}
+        assert 0 < here["clouds"] < whole.info["clouds"]
         right, mine = whole.read(bounds=box), part.read(bounds=box)
         assert (mine.xyz == right.xyz).all()
         assert 0 < len(mine) < len(part.read()) < len(whole.read())

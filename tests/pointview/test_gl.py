@@ -24,6 +24,8 @@ moderngl = pytest.importorskip("moderngl")
 LEVELS = 2
 SHARE = 0.001
 TIES = 0.02
+RESOLUTION = 2.5e-7
+"""Of a depth buffer of 24 bits as these views use it, relative."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -57,12 +59,18 @@ def scene(request, tmp_path_factory):
     return model, camera
 
 
-def assert_same(frame, oracle, share=SHARE):
+def assert_same(frame, oracle, share=SHARE, *, ties=False):
     covered = np.isfinite(frame.depth) | np.isfinite(oracle.depth)
     assert covered.sum() > 200
     assert (np.isfinite(frame.depth) != np.isfinite(oracle.depth)).sum() <= share * covered.sum()
     difference = np.abs(frame.rgb.astype(int) - oracle.rgb).max(axis=2)
-    assert (difference[covered] > LEVELS).mean() <= share
+    differs = covered & (difference > LEVELS)
+    if ties:
+        both = np.where(np.isfinite(frame.depth), frame.depth, 0), np.where(np.isfinite(oracle.depth), oracle.depth, 0)
+        tied = differs & np.isclose(*both, rtol=RESOLUTION, atol=0)
+        assert tied.sum() <= TIES * covered.sum()
+        differs &= ~tied
+    assert differs.sum() <= share * covered.sum()
     assert difference[~covered].max(initial=0) == 0
     assert (frame.node != oracle.node)[covered].mean() <= TIES
     both = np.isfinite(frame.depth) & np.isfinite(oracle.depth)
@@ -95,10 +103,9 @@ def test_other_splats(gl, scene, splat):
     style, backend, oracle = Style(splat=splat), gl(model.header), CpuBackend(model.header)
     for tolerance in (1.0, 6.0):
         cut = refine(model.index, camera, tolerance, model.everything)
-        # They have nearly one depth: where many overlap, more of them tie in the 24 bits of a depth buffer, and the
-        # first one drawn stays. How often it is the nearest depends on the order of the samples in their clouds.
-        expected = oracle.draw(cut, model.take, camera, style)
-        assert_same(backend.draw(cut, model.take, camera, style), expected, 8 * SHARE)
+        # They have nearly one depth: where many overlap, some tie in the 24 bits of a depth buffer.
+        expected, frame = oracle.draw(cut, model.take, camera, style), backend.draw(cut, model.take, camera, style)
+        assert_same(frame, expected, ties=True)
     backend.close()
 
 
