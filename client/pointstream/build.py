@@ -57,12 +57,15 @@ class Build:
         The store has them without asking over a link.
     waiting : dict of int to list
         What arrived and can be decoded after a node that is not here yet, by that node.
+    waiting_bytes : int
+        Of these.
     tail : (int, bytes)
         The start of an object that the opening cut in two, and where in the file it begins; given out once.
     """
 
     def __init__(self, index: IndexTree, *, capacity: int, store: Store) -> None:
         self.index, self._store = index, store
+        self._sample_bytes = 6 + sum(entry.code_dtype.itemsize * entry.components for entry in index.header.attributes)
         self.residency = Residency(len(index), capacity)
         self.clouds: dict[int, Cloud] = {}
         self.absent: NDArray[np.bool_] = np.zeros(len(index), dtype=bool)
@@ -71,6 +74,7 @@ class Build:
         self.length = index.header.bytes if store.length is None else min(index.header.bytes, store.length)
         self.lost_pages: set[int] = set()
         self.waiting: dict[int, list[Arrived]] = {}
+        self.waiting_bytes = self._waiting_decoded = 0
         self.tail: tuple[int, bytes] = (0, b"")
         self._failures: dict[int, int] = {}
         for page in np.flatnonzero(index.page_loaded).tolist():
@@ -135,6 +139,34 @@ class Build:
             if above not in self.clouds:
                 return above
         return {above: self.clouds[above] for above in line}
+
+    def wait(self, came: Arrived, above: int) -> None:
+        """Keep what can only be decoded after a node."""
+        self.waiting.setdefault(above, []).append(came)
+        self.waiting_bytes += len(came.data)
+        self._waiting_decoded += self._decoded_bytes(came)
+
+    def release(self, above: int) -> list[Arrived]:
+        """Give what waits for a node, and keep it no longer."""
+        released = self.waiting.pop(above, [])
+        self.waiting_bytes -= sum(len(came.data) for came in released)
+        self._waiting_decoded -= sum(map(self._decoded_bytes, released))
+        return released
+
+    def forget(self, nodes: list[int]) -> None:
+        """Let go of what waits for nodes, and of what waits for that: if it is wanted it is asked for again."""
+        while nodes:
+            for came in self.release(nodes.pop()):
+                self.busy[came.item.key] = False
+                nodes.append(came.item.key)
+
+    def roomy(self, flying: list[int]) -> bool:
+        """Whether there is room for more ahead of wants, beside what has come and waits and the clouds in flight."""
+        flying = [node for node in flying if not (self.busy[node] or self.residency.resident[node])]
+        return self.residency.roomy(self._waiting_decoded + int(self.index.samples[flying].sum()) * self._sample_bytes)
+
+    def _decoded_bytes(self, came: Arrived) -> int:
+        return int(self.index.samples[came.item.key]) * self._sample_bytes
 
     def _with_ancestors(self, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
         """Put before nodes those that are not here and without which they cannot be decoded."""

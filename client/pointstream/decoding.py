@@ -28,16 +28,17 @@ def decode_checked(data: bytes, *, node: int, index: IndexTree, family: Mapping[
     Raises
     ------
     Corrupt
-        Naming the node.
+        Naming the node; `Untold` if only an ancestor is damaged.
     """
     if zlib.crc32(data) != int(index.crc[node]):
         raise Corrupt(f"cloud {node}: checksum differs, the file or the line damaged it")
+    told_from = context(index, node, family)
     try:
         return decode_cloud(
             data,
             samples=int(index.samples[node]),
             schema=index.header.attributes,
-            context=context(index, node, family),
+            context=told_from,
         )
     except Corrupt as error:
         raise Corrupt(f"cloud {node}: {str(error).removeprefix('cloud: ')}") from error

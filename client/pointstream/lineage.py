@@ -36,15 +36,19 @@ def context(index: IndexTree, node: int, family: Mapping[int, Cloud | Corrupt]) 
     Raises
     ------
     Corrupt
-        If one of them is damaged.
+        If one of them is damaged: `Untold`.
     """
     clouds = []
     for above in ancestors(index, node):
         cloud = family[above]
         if isinstance(cloud, Corrupt):
-            raise Corrupt(f"cloud {node}: it is told from one that is damaged ({cloud})")
+            raise Untold(f"cloud {node}: it is told from one that is damaged ({cloud})")
         clouds.append(cloud)
     return clouds
+
+
+class Untold(Corrupt):
+    """Nothing is known to be wrong with a cloud, but one that it is told from is damaged."""
 
 
 class Lineage:

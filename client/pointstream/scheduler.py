@@ -141,6 +141,11 @@ class Scheduler:
         """Wants of the last offer that are not in flight."""
         return self._wants.waiting
 
+    @property
+    def ahead(self) -> list[int]:
+        """Clouds in flight that nobody wants yet."""
+        return [item.key for request in self._flying if request.ahead for item in request.items if item.key >= 0]
+
     def flies(self, key: int) -> bool:
         """Whether a key is in flight."""
         return key in self._keys

@@ -137,7 +137,7 @@ class Traffic:
             and self.store.meter is not None
             and not self.scheduler.waiting
             and self.build is not None
-            and self.build.residency.roomy
+            and self.build.roomy(self.scheduler.ahead)
         )
 
     def draws(self, build: Build, nodes: NDArray[np.int64]) -> None:
@@ -164,7 +164,7 @@ class Traffic:
             return
         meter = self.store.meter
         link = None if meter is None else LinkState(meter.admission(now), meter.rtt, meter.measured)
-        for request in self.scheduler.issue(now, link, ahead=build.residency.roomy):
+        for request in self.scheduler.issue(now, link, ahead=build.roomy(self.scheduler.ahead)):
             self._spawn(self._fetch(build, request, self.scheduler))
 
     def _spawn(self, work: Coroutine[None, None, None]) -> None:
@@ -303,27 +303,26 @@ class Traffic:
         """Decode a cloud once those that it is told from are here."""
         family = build.family(came.item.key)
         if isinstance(family, int):
-            build.waiting.setdefault(family, []).append(came)
+            build.wait(came, family)
             return
         done = partial(self._decoded, build, came.item, came.data, ahead=came.ahead)
         self.decoder.decode(came.data, node=came.item.key, index=build.index, family=family, done=done)
 
     def _go_on(self, build: Build, node: int) -> None:
         """Decode what waited for a node."""
-        for came in build.waiting.pop(node, []):
+        for came in build.release(node):
             self._decode(build, came)
 
     def _forget_orphans(self, build: Build) -> None:
-        """Let go of what waits for nodes that are not on their way: it will be wanted again."""
+        """Let go of what waits for clouds that never come; if much waits, also for those that are not on their way."""
+        much = build.waiting_bytes > self._options.most_orphans
         lost = [
             node
             for node in build.waiting
-            if not (build.busy[node] or self.scheduler.flies(node) or self.local.flies(node))
+            if build.absent[node]
+            or (much and not (build.busy[node] or self.scheduler.flies(node) or self.local.flies(node)))
         ]
-        while lost:
-            for came in build.waiting.pop(lost.pop(), []):
-                build.busy[came.item.key] = False
-                lost.append(came.item.key)
+        build.forget(lost)
 
     def _page_arrived(self, build: Build, page: int, data: bytes, request: Request, assembly: Assembly) -> None:
         try:

@@ -15,6 +15,7 @@ from lpc.header import compute_digest
 from lpc.octahedral import max_error_degrees
 from lpc.page import PAGE_HEADER
 
+from .lineage import Untold
 from .matching import Matcher, MatchReport
 
 if TYPE_CHECKING:
@@ -140,9 +141,12 @@ async def verify(
         tempfile.TemporaryDirectory(prefix="pointstream-") as folder,
         Matcher(header, _comparable(header, scans), Path(folder)) as matcher,
     ):
-        samples = 0
+        samples = untold = 0
         async for node, cloud in reader.clouds(nodes):
             advance(1)
+            if isinstance(cloud, Untold):
+                untold += 1
+                continue
             if isinstance(cloud, Corrupt):
                 problems.add(str(cloud))
                 continue
@@ -151,6 +155,8 @@ async def verify(
             _check_node(reader.index, node, points, problems)
             if scans:
                 matcher.add_out(cloud.lattice(), points.attributes)
+        if untold:
+            problems.add(f"{untold} sound clouds cannot be decoded, because they are told from damaged ones")
         if complete and samples != header.samples:
             problems.add(f"the clouds hold {samples} samples, the header says {header.samples}")
         match = _match(matcher, scans, header, problems) if scans else None

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.build import build_bytes
+from support.frames import subtrees, whole_index
 
 from lpc.header import parse_header, seal
 from lpc.index import IndexTree
@@ -151,15 +152,14 @@ def test_a_cut_file_says_how_much_is_missing(length: int, model: bytes) -> None:
 
 
 def test_every_damaged_cloud_is_named(model: bytes) -> None:
-    index = IndexTree(parse_header(model))
-    place = index.page_range(0)
-    index.add_page(0, model[place.start : place.stop])
+    index = whole_index(model)
     damaged = bytearray(model)
     for node in (2, 11):
         damaged[index.offset[node] + 15] ^= 2
     report = check(bytes(damaged))
     assert [text.split(":")[0] for text in report.problems[:2]] == ["cloud 2", "cloud 11"]
-    assert "the header says 20000" in report.problems[2]
+    assert report.problems[2].startswith(f"{len(subtrees(index, [2, 11])) - 2} sound clouds cannot be decoded")
+    assert "the header says 20000" in report.problems[3]
 
 
 def test_a_damaged_page_hides_its_clouds_and_the_rest_is_checked(model: bytes) -> None:
