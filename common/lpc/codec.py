@@ -18,7 +18,7 @@ import zstandard
 
 from .channels import Channels, channels_of, from_channels, to_channels
 from .cloud import Cloud
-from .context import ANCESTORS, Near, select
+from .context import ANCESTORS, Near, Part, Place, select
 from .errors import Corrupt
 from .lattice import dequantise
 from .octahedral import decode_normals
@@ -82,13 +82,9 @@ class _Codec(Protocol):
         self, position: NDArray[np.uint16], rows: NDArray[np.uint32], near: Near, channels: Channels, nbits: int
     ) -> None: ...
 
-    def inside(
-        self,
-        position: NDArray[np.uint16],
-        low: tuple[int, int, int],
-        high: tuple[int, int, int],
-        away: tuple[int, int, int],
-    ) -> tuple[NDArray[np.int32], NDArray[np.intp]]: ...
+    def box(self, position: NDArray[np.uint16]) -> tuple[Place, Place]: ...
+
+    def take(self, parts: Sequence[Part], schema: Schema) -> Near: ...
 
     def turn_back(self, rows: NDArray[np.uint32], channels: Channels, turn: int) -> None: ...
 
@@ -232,7 +228,7 @@ def near_box(clouds: Sequence[Cloud], schema: Schema, low: NDArray[np.int64], hi
     if (high - low).max() >= 1 << TOP_BITS:
         return None
     box = np.stack([low - low, high - low]).astype(np.uint16)
-    return select(clouds, schema, corner=(x, y, z), shift=0, position=box, inside=_codec("auto").inside)
+    return select(clouds, schema, corner=(x, y, z), shift=0, position=box, engine=_codec("auto"))
 
 
 class _Writer:
@@ -288,7 +284,7 @@ class _Writer:
                 corner=(x, y, z),
                 shift=placed.shift,
                 position=placed.position,
-                inside=self._codec.inside,
+                engine=self._codec,
             )
             near = near if near.rows.shape[1] else None
         packed = self._codec.pack(placed, self._lattice, self._rows, self._channels, self._window, near)
@@ -346,7 +342,7 @@ def decode_cloud(
             corner=layout.origin,
             shift=layout.shift,
             position=unpacked.position,
-            inside=codec.inside,
+            engine=codec,
         )
         codec.add_guesses(unpacked.position, unpacked.rows, near, channels, layout.nbits)
     for first, centre in channels.normals.tolist():

@@ -12,7 +12,8 @@ import numpy as np
 from numba import njit
 
 from .guess_compiled import add_guesses as add_guesses
-from .guess_compiled import inside as inside
+from .guess_compiled import box as box
+from .guess_compiled import take as take
 from .guess_compiled import without_guesses
 from .normals_compiled import best_turn
 from .normals_compiled import turn_back as turn_back

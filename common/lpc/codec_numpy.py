@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .guess_numpy import add_guesses as add_guesses
-from .guess_numpy import inside as inside
+from .guess_numpy import box as box
+from .guess_numpy import take as take
 from .guess_numpy import without_guesses
 from .normals_numpy import best_turn
 from .normals_numpy import turn_back as turn_back

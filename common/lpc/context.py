@@ -7,24 +7,21 @@ of each: better company than the samples before it in its own order.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
 from .channels import rows_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
     from .attributes import Schema
     from .cloud import Cloud
 
-    Inside = Callable[
-        [NDArray[np.uint16], tuple[int, int, int], tuple[int, int, int], tuple[int, int, int]],
-        tuple[NDArray[np.int32], NDArray[np.intp]],
-    ]
+Place = tuple[int, int, int]
 
 ANCESTORS = 4
 """Of those further up hardly any sample is near."""
@@ -63,14 +60,27 @@ class Near:
     rows: NDArray[np.uint32]
 
 
+class Engine(Protocol):
+    """What `guess_numpy` and `guess_compiled` both do here."""
+
+    def box(self, position: NDArray[np.uint16]) -> tuple[Place, Place]:
+        """Smallest and largest local coordinates of (k, 3)."""
+
+    def take(self, parts: Sequence[Part], schema: Schema) -> Near:
+        """Take samples of ancestors, one part after another."""
+
+
+class Part(NamedTuple):
+    """Samples of an ancestor from `low` to `high`, in its local coordinates; those plus `away` are the cloud's."""
+
+    cloud: Cloud
+    low: Place
+    high: Place
+    away: Place
+
+
 def select(
-    clouds: Sequence[Cloud],
-    schema: Schema,
-    *,
-    corner: tuple[int, int, int],
-    shift: int,
-    position: NDArray[np.uint16],
-    inside: Inside,
+    clouds: Sequence[Cloud], schema: Schema, *, corner: Place, shift: int, position: NDArray[np.uint16], engine: Engine
 ) -> Near:
     """Take the samples of ancestors that stand in the box of a cloud.
 
@@ -83,25 +93,27 @@ def select(
         Of the cloud.
     position : ndarray, (k, 3) uint16
         All its local coordinates without low bits: their box is meant.
-    inside : callable
-        ``inside(position, low, high, away)`` gives the coordinates plus `away` of samples from `low` to `high`, (3, n),
-        and their numbers.
+    engine : Engine
     """
-    columns = position.T.copy()  # three times as fast as the array as it is
-    low, high = columns.min(axis=1).tolist(), columns.max(axis=1).tolist()
-    places, members = [np.empty((3, 0), np.int32)], []
-    for cloud in clouds[-ANCESTORS:]:
+    clouds, (low, high) = clouds[-ANCESTORS:], engine.box(position)
+    if shift or any(cloud.low is not None for cloud in clouds):
+        return _select_wide(clouds, schema, corner, shift, low, high)
+    parts = []
+    for cloud in clouds:
         x, y, z = (int(above) - own for above, own in zip(cloud.origin.tolist(), corner, strict=True))
-        if cloud.low is None and shift == 0:
-            least = max(low[0] - x, 0), max(low[1] - y, 0), max(low[2] - z, 0)
-            most = min(high[0] - x, 0xFFFF), min(high[1] - y, 0xFFFF), min(high[2] - z, 0xFFFF)
-            if least[0] > most[0] or least[1] > most[1] or least[2] > most[2]:
-                continue
-            place, index = inside(cloud.position, least, most, (x, y, z))
-        else:
-            local = (cloud.lattice() - np.array(corner, np.int64)) >> shift
-            index = np.flatnonzero(((local >= low) & (local <= high)).all(axis=1))
-            place = local[index].T.astype(np.int32)
-        places.append(place)
+        least = max(low[0] - x, 0), max(low[1] - y, 0), max(low[2] - z, 0)
+        most = min(high[0] - x, 0xFFFF), min(high[1] - y, 0xFFFF), min(high[2] - z, 0xFFFF)
+        if least[0] <= most[0] and least[1] <= most[1] and least[2] <= most[2]:
+            parts.append(Part(cloud, least, most, (x, y, z)))
+    return engine.take(parts, schema)
+
+
+def _select_wide(clouds: Sequence[Cloud], schema: Schema, corner: Place, shift: int, low: Place, high: Place) -> Near:
+    """Do so where low bits are kept apart."""
+    places, members = [np.empty((3, 0), np.int32)], []
+    for cloud in clouds:
+        local = (cloud.lattice() - np.array(corner, np.int64)) >> shift
+        index = np.flatnonzero(((local >= low) & (local <= high)).all(axis=1))
+        places.append(local[index].T.astype(np.int32))
         members.append((cloud, index))
     return Near(np.concatenate(places, axis=1), rows_of(members, schema))

@@ -10,25 +10,47 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba import njit
 
+from .context import Near
+
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
+    from .attributes import Schema
     from .channels import Channels
-    from .context import Near
+    from .context import Part, Place
 
 KEPT = 7
 MOST = 64
 DIGIT = 12
 
 
-def inside(
-    position: NDArray[np.uint16], low: tuple[int, int, int], high: tuple[int, int, int], away: tuple[int, int, int]
-) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
-    """Coordinates plus `away` of the samples from `low` to `high`, (3, n), and their numbers."""
-    place = np.empty((3, len(position)), np.int32)
-    index = np.empty(len(position), np.intp)
-    count = _inside(position, low, high, away, place, index)
-    return place[:, :count], index[:count]
+def box(position: NDArray[np.uint16]) -> tuple[Place, Place]:
+    """Smallest and largest local coordinates of (k, 3)."""
+    found: tuple[Place, Place] = _box(position)
+    return found
+
+
+def take(parts: Sequence[Part], schema: Schema) -> Near:
+    """Take samples of ancestors, one part after another."""
+    guessed = [attribute for attribute in schema if attribute.kind != "scalar"]
+    most = sum(len(part.cloud) for part in parts)
+    place = np.empty((3, most), np.int32)
+    rows = np.empty((sum(attribute.components for attribute in guessed), most), np.uint32)
+    index = np.empty(most, np.int32)
+    count = 0
+    for cloud, low, high, away in parts:
+        begin, count = count, int(_inside(cloud.position, low, high, away, count, place, index))
+        row = 0
+        for attribute in guessed:
+            codes = cloud.codes[attribute.name]
+            if attribute.kind == "normal":
+                _take_normals(codes, index, begin, count, rows, row)
+            else:
+                _take_colors(codes, index, begin, count, attribute.bits, rows, row)
+            row += attribute.components
+    return Near(place[:, :count].copy(), rows[:, :count].copy())
 
 
 def add_guesses(
@@ -48,15 +70,50 @@ def without_guesses(
 
 
 @njit(cache=True, nogil=True)
-def _inside(position: Any, low: Any, high: Any, away: Any, place: Any, index: Any) -> int:
-    count = 0
+def _box(position: Any) -> Any:
+    low_x = low_y = low_z = np.uint16(0xFFFF)
+    high_x = high_y = high_z = np.uint16(0)
     for i in range(len(position)):
-        x, y, z = np.int64(position[i, 0]), np.int64(position[i, 1]), np.int64(position[i, 2])
-        if low[0] <= x <= high[0] and low[1] <= y <= high[1] and low[2] <= z <= high[2]:
-            place[0, count], place[1, count], place[2, count] = x + away[0], y + away[1], z + away[2]
-            index[count] = i
-            count += 1
+        x, y, z = position[i, 0], position[i, 1], position[i, 2]
+        low_x, low_y, low_z = min(low_x, x), min(low_y, y), min(low_z, z)
+        high_x, high_y, high_z = max(high_x, x), max(high_y, y), max(high_z, z)
+    return (int(low_x), int(low_y), int(low_z)), (int(high_x), int(high_y), int(high_z))
+
+
+@njit(cache=True, nogil=True)
+def _inside(position: Any, low: Any, high: Any, away: Any, count: int, place: Any, index: Any) -> int:
+    """Add places and numbers of the samples from `low` to `high` after the first `count`; how many there are then."""
+    low_x, low_y, low_z = np.uint32(low[0]), np.uint32(low[1]), np.uint32(low[2])
+    # Below `low` a difference wraps around: one comparison sees both ends.
+    size_x, size_y, size_z = np.uint32(high[0]) - low_x, np.uint32(high[1]) - low_y, np.uint32(high[2]) - low_z
+    add_x, add_y, add_z = np.int32(away[0]), np.int32(away[1]), np.int32(away[2])
+    for i in range(len(position)):
+        x, y, z = np.uint32(position[i, 0]), np.uint32(position[i, 1]), np.uint32(position[i, 2])
+        # Written always and kept if it is inside: no branch to guess.
+        place[0, count], place[1, count], place[2, count] = x + add_x, y + add_y, z + add_z
+        index[count] = i
+        count += (np.uint32(x - low_x) <= size_x) & (np.uint32(y - low_y) <= size_y) & (np.uint32(z - low_z) <= size_z)
     return count
+
+
+@njit(cache=True, nogil=True)
+def _take_normals(codes: Any, index: Any, begin: int, end: int, rows: Any, row: int) -> None:
+    for at in range(begin, end):
+        i = index[at]
+        rows[row, at], rows[row + 1, at] = codes[i, 0], codes[i, 1]
+
+
+@njit(cache=True, nogil=True)
+def _take_colors(codes: Any, index: Any, begin: int, end: int, bits: int, rows: Any, row: int) -> None:
+    """Take them as YCoCg-R (`channels`)."""
+    modulo = (np.int32(1) << (bits + 1)) - 1
+    for at in range(begin, end):
+        i = index[at]
+        red, green, blue = np.int32(codes[i, 0]), np.int32(codes[i, 1]), np.int32(codes[i, 2])
+        orange = red - blue
+        base = blue + (orange >> 1)
+        lime = green - base
+        rows[row, at], rows[row + 1, at], rows[row + 2, at] = base + (lime >> 1), orange & modulo, lime & modulo
 
 
 @njit(cache=True, nogil=True)
@@ -76,8 +133,8 @@ def _code(x: Any, y: Any, z: Any, ahead: int, shift: int) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _sort(code: Any, order: Any, code_spare: Any, order_spare: Any, count: Any) -> None:
-    """Radix sort of 24 bits, stable, in two passes: the result lies where it was."""
+def _sort(code: Any, order: Any, spare: Any, count: Any) -> None:
+    """Radix sort of codes of 24 bits, stable, in two passes: `order` gets their numbers."""
     mask = np.uint32((1 << DIGIT) - 1)
     count[:] = 0
     for i in range(len(code)):
@@ -95,30 +152,31 @@ def _sort(code: Any, order: Any, code_spare: Any, order_spare: Any, count: Any) 
         digit = code[i] & mask
         to = count[0, digit]
         count[0, digit] = to + 1
-        code_spare[to], order_spare[to] = code[i], order[i]
+        # High digit and number travel as one: half the stores.
+        spare[to] = np.uint64(code[i] >> np.uint32(DIGIT)) << np.uint64(32) | np.uint64(i)
     for i in range(len(code)):
-        digit = code_spare[i] >> np.uint32(DIGIT)
+        pair = spare[i]
+        digit = pair >> np.uint64(32)
         to = count[1, digit]
         count[1, digit] = to + 1
-        order[to] = order_spare[i]
+        order[to] = np.uint32(pair)
 
 
 @njit(cache=True, nogil=True)
 def _beside(near: Any, position: Any, nbits: int, company: Any) -> None:
     """Numbers of the two context samples before and the two after each sample in both orders; n: there is none."""
     k, n = len(position), near.shape[1]
-    code, code_spare = np.empty(k + n, np.uint32), np.empty(k + n, np.uint32)
-    order, order_spare = np.empty(k + n, np.uint32), np.empty(k + n, np.uint32)
+    code, order, spare = np.empty(k + n, np.uint32), np.empty(k + n, np.uint32), np.empty(k + n, np.uint64)
     count = np.empty((2, 1 << DIGIT), np.int32)
     shift = max(0, nbits - KEPT)
     for which in range(2):
         ahead = which * ((1 << nbits) // 3)
         # The cloud's own come first: of equal codes those of the context stand after them.
         for i in range(k):
-            code[i], order[i] = _code(position[i, 0], position[i, 1], position[i, 2], ahead, shift), i
+            code[i] = _code(position[i, 0], position[i, 1], position[i, 2], ahead, shift)
         for i in range(n):
-            code[k + i], order[k + i] = _code(near[0, i], near[1, i], near[2, i], ahead, shift), k + i
-        _sort(code, order, code_spare, order_spare, count)
+            code[k + i] = _code(near[0, i], near[1, i], near[2, i], ahead, shift)
+        _sort(code, order, spare, count)
         one = two = np.uint32(n)
         for at in range(k + n):
             i = order[at]

@@ -10,13 +10,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .channels import rows_of
+from .context import Near
 from .octahedral import fold_codes, unfold_codes
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
+    from .attributes import Schema
     from .channels import Channels
-    from .context import Near
+    from .context import Part, Place
 
     Ints = NDArray[np.int32]
 
@@ -32,19 +37,28 @@ _TURNS = np.array([[1, 2, 0], [2, 0, 1], [0, 1, 2]])
 _SPREAD = np.array([sum((value >> bit & 1) << (3 * bit) for bit in range(8)) for value in range(256)], np.int32)
 
 
-def inside(
-    position: NDArray[np.uint16], low: tuple[int, int, int], high: tuple[int, int, int], away: tuple[int, int, int]
-) -> tuple[Ints, NDArray[np.intp]]:
-    """Coordinates plus `away` of the samples from `low` to `high`, (3, n), and their numbers."""
-    columns = position.T.copy()  # faster than the array as it is
-    # Below `low` a difference wraps around: one comparison sees both ends.
-    columns -= np.array(low, np.uint16)[:, None]
-    outside = columns > np.array(high, np.uint16)[:, None] - np.array(low, np.uint16)[:, None]
-    index = np.flatnonzero(~outside.any(axis=0))
-    place = np.empty((3, len(index)), np.int32)
-    for column, least, add, out in zip(columns, low, away, place, strict=True):
-        np.add(column.take(index), np.int32(least + add), out=out)
-    return place, index
+def box(position: NDArray[np.uint16]) -> tuple[Place, Place]:
+    """Smallest and largest local coordinates of (k, 3)."""
+    columns = position.T.copy()  # three times as fast as the array as it is
+    low, high = columns.min(axis=1).tolist(), columns.max(axis=1).tolist()
+    return (low[0], low[1], low[2]), (high[0], high[1], high[2])
+
+
+def take(parts: Sequence[Part], schema: Schema) -> Near:
+    """Take samples of ancestors, one part after another."""
+    places, members = [np.empty((3, 0), np.int32)], []
+    for cloud, low, high, away in parts:
+        columns = cloud.position.T.copy()
+        # Below `low` a difference wraps around: one comparison sees both ends.
+        columns -= np.array(low, np.uint16)[:, None]
+        outside = columns > np.array(high, np.uint16)[:, None] - np.array(low, np.uint16)[:, None]
+        index = np.flatnonzero(~(outside[0] | outside[1] | outside[2]))
+        place = np.empty((3, len(index)), np.int32)
+        for column, least, add, out in zip(columns, low, away, place, strict=True):
+            np.add(column.take(index), np.int32(least + add), out=out)
+        places.append(place)
+        members.append((cloud, index))
+    return Near(np.concatenate(places, axis=1), rows_of(members, schema))
 
 
 def add_guesses(
