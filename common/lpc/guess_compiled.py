@@ -125,11 +125,13 @@ def _spread(value: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _code(x: Any, y: Any, z: Any, ahead: int, shift: int) -> Any:
-    """Morton code of a place in one of the orders."""
-    low = _spread(np.uint32((np.int64(x) + ahead) >> shift))
-    middle = _spread(np.uint32((np.int64(y) + ahead) >> shift))
-    return low | (middle << np.uint32(1)) | (_spread(np.uint32((np.int64(z) + ahead) >> shift)) << np.uint32(2))
+def _codes(x: Any, y: Any, z: Any, ahead: int, shift: int, code: Any) -> None:
+    """Morton codes of places in one of the orders."""
+    by, add = np.uint32(shift), np.uint32(ahead)
+    for i in range(len(x)):
+        low, middle = _spread((np.uint32(x[i]) + add) >> by), _spread((np.uint32(y[i]) + add) >> by)
+        high = _spread((np.uint32(z[i]) + add) >> by)
+        code[i] = low | (middle << np.uint32(1)) | (high << np.uint32(2))
 
 
 @njit(cache=True, nogil=True)
@@ -140,7 +142,7 @@ def _sort(code: Any, order: Any, spare: Any, count: Any) -> None:
     for i in range(len(code)):
         count[0, code[i] & mask] += 1
         count[1, code[i] >> np.uint32(DIGIT)] += 1
-    first = second = np.int32(0)
+    first = second = np.uint32(0)
     for digit in range(1 << DIGIT):
         here = count[0, digit]
         count[0, digit] = first
@@ -163,34 +165,26 @@ def _sort(code: Any, order: Any, spare: Any, count: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _beside(near: Any, position: Any, nbits: int, company: Any) -> None:
-    """Numbers of the two context samples before and the two after each sample in both orders; n: there is none."""
-    k, n = len(position), near.shape[1]
+def _beside(near: Any, columns: Any, nbits: int, line: Any, start: Any) -> None:
+    """Order the context twice: `line` gets its numbers after two times n, `start` where in it a sample's company is."""
+    k, n = columns.shape[1], near.shape[1]
     code, order, spare = np.empty(k + n, np.uint32), np.empty(k + n, np.uint32), np.empty(k + n, np.uint64)
-    count = np.empty((2, 1 << DIGIT), np.int32)
+    count = np.empty((2, 1 << DIGIT), np.uint32)
     shift = max(0, nbits - KEPT)
     for which in range(2):
         ahead = which * ((1 << nbits) // 3)
         # The cloud's own come first: of equal codes those of the context stand after them.
-        for i in range(k):
-            code[i] = _code(position[i, 0], position[i, 1], position[i, 2], ahead, shift)
-        for i in range(n):
-            code[k + i] = _code(near[0, i], near[1, i], near[2, i], ahead, shift)
+        _codes(columns[0], columns[1], columns[2], ahead, shift, code[:k])
+        _codes(near[0], near[1], near[2], ahead, shift, code[k:])
         _sort(code, order, spare, count)
-        one = two = np.uint32(n)
+        below = np.uint32(0)
         for at in range(k + n):
             i = order[at]
-            if i < k:
-                company[i, 4 * which], company[i, 4 * which + 1] = one, two
-            else:
-                one, two = i - np.uint32(k), one
-        one = two = np.uint32(n)
-        for at in range(k + n - 1, -1, -1):
-            i = order[at]
-            if i < k:
-                company[i, 4 * which + 2], company[i, 4 * which + 3] = one, two
-            else:
-                one, two = i - np.uint32(k), one
+            # Both are written always, and what does not hold is written over: no branch to guess.
+            line[which, below + np.uint32(2)] = i - np.uint32(k)
+            start[which, min(i, np.uint32(k))] = below
+            below += np.uint32(i >= np.uint32(k))
+        line[which, 0] = line[which, 1] = line[which, n + 2] = line[which, n + 3] = n
 
 
 @njit(cache=True, nogil=True)
@@ -313,44 +307,46 @@ def _color(
 def _guess(near: Any, near_rows: Any, position: Any, rows: Any, guessed: Any, nbits: int, decoding: bool) -> None:
     """Decode the rows that are guessed, or encode them, in place."""
     k, n, fields = len(position), near.shape[1], len(guessed)
-    company = np.empty((k, 8), np.uint32)
-    _beside(near, position, nbits, company)
-    # Who is missing, number n, stands far away and is worth nothing.
-    place = np.empty((n + 1 + k, 4), np.int32)
-    place[n] = 1 << 30
-    values = np.zeros((n + 1 + k, 3 * fields), np.int32)
-    for axis in range(3):
-        for i in range(n):
-            place[i, axis] = near[axis, i]
-        for i in range(k):
-            place[n + 1 + i, axis] = position[i, axis]
+    columns = np.empty((3, k), np.uint16)
+    # Of the context, of who is missing, number n, far away and worth nothing, and of the cloud: places, then values.
+    table = np.zeros((n + 1 + k, 4 + 4 * fields), np.int32)
+    for i in range(n):
+        table[i, 0], table[i, 1], table[i, 2] = near[0, i], near[1, i], near[2, i]
+    table[n, 0] = table[n, 1] = table[n, 2] = 1 << 30
+    for i in range(k):
+        x, y, z = position[i, 0], position[i, 1], position[i, 2]
+        columns[0, i], columns[1, i], columns[2, i] = x, y, z
+        table[n + 1 + i, 0], table[n + 1 + i, 1], table[n + 1 + i, 2] = x, y, z
     row = 0
     for field in range(fields):
+        at = 4 + 4 * field
         for i in range(n):
-            _value(near_rows, row, i, guessed[field, 1], guessed[field, 2], values, i, 3 * field)
+            _value(near_rows, row, i, guessed[field, 1], guessed[field, 2], table, i, at)
         if not decoding:
             for i in range(k):
-                _value(rows, guessed[field, 0], i, guessed[field, 1], guessed[field, 2], values, n + 1 + i, 3 * field)
+                _value(rows, guessed[field, 0], i, guessed[field, 1], guessed[field, 2], table, n + 1 + i, at)
         row += 2 if guessed[field, 1] else 3
+    line, start = np.empty((2, n + 4), np.uint32), np.empty((2, k + 1), np.uint32)
+    _beside(near, columns, nbits, line, start)
 
-    rows_of, normals, widths = guessed[:, 0].copy(), guessed[:, 1].copy(), guessed[:, 2].copy()
     sound = np.ones(fields, np.bool_)
-    member = np.empty(10, np.int64)
-    weight = np.empty(10, np.int64)
+    member, weight = np.empty(10, np.uint32), np.empty(10, np.int64)
     distance = np.empty(10, np.float64)
     bits_of = distance.view(np.int64)
     for layer in range(3):
-        start, step, reach = (0, 4, 0) if layer == 0 else (2, 4, 2) if layer == 1 else (1, 2, 1)
-        for i in range(start, k, step):
-            own = n + 1 + i
-            for which in range(8):
-                member[which] = company[i, which]
+        begin, step, reach = (0, 4, 0) if layer == 0 else (2, 4, 2) if layer == 1 else (1, 2, 1)
+        for i in range(begin, k, step):
+            own = np.uint32(n + 1 + i)
+            first, second = start[0, i], start[1, i]
+            for which in range(4):
+                member[which], member[4 + which] = line[0, first + which], line[1, second + which]
             member[8] = own - reach if reach else n
             member[9] = own + reach if reach and i + reach < k else n
-            x, y, z = np.int64(place[own, 0]), np.int64(place[own, 1]), np.int64(place[own, 2])
+            x, y, z = table[own, 0], table[own, 1], table[own, 2]
             for m in range(10):
-                dx, dy, dz = place[member[m], 0] - x, place[member[m], 1] - y, place[member[m], 2] - z
-                distance[m] = np.float64(dx * dx + dy * dy + dz * dz + 1)
+                at = member[m]
+                dx, dy, dz = np.float64(table[at, 0] - x), np.float64(table[at, 1] - y), np.float64(table[at, 2] - z)
+                distance[m] = dx * dx + dy * dy + dz * dz + 1.0
             nearest = bits_of[0]
             for m in range(1, 10):
                 nearest = min(nearest, bits_of[m])
@@ -360,17 +356,18 @@ def _guess(near: Any, near_rows: Any, position: Any, rows: Any, guessed: Any, nb
                 weight[m] = np.int64(MOST) >> min((bits_of[m] >> 51) - nearest, 7)
                 total += weight[m]
             for field in range(fields):
-                at = 3 * field
+                to = 4 + 4 * field
                 x, y, z = np.int64(0), np.int64(0), np.int64(0)
                 for m in range(10):
-                    x += weight[m] * values[member[m], at]
-                    y += weight[m] * values[member[m], at + 1]
-                    z += weight[m] * values[member[m], at + 2]
-                row, bits = rows_of[field], widths[field]
-                if normals[field]:
-                    sound[field] &= _normal(x, y, z, rows, row, i, bits, decoding, values, own, at)
+                    at = member[m]
+                    x += weight[m] * table[at, to]
+                    y += weight[m] * table[at, to + 1]
+                    z += weight[m] * table[at, to + 2]
+                row, bits = guessed[field, 0], guessed[field, 2]
+                if guessed[field, 1]:
+                    sound[field] &= _normal(x, y, z, rows, row, i, bits, decoding, table, own, to)
                 else:
-                    _color(x, y, z, total, rows, row, i, bits, decoding, values, own, at)
+                    _color(x, y, z, total, rows, row, i, bits, decoding, table, own, to)
     if decoding:
         for field in range(fields):
             if not sound[field]:
