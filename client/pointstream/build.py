@@ -126,10 +126,11 @@ class Build:
             self.lost_pages.add(~key)
         else:
             self.absent[key] = True
-            below = self.index.children[[key]]
-            while (below := below[below >= 0]).size:
-                self._bereave(below.astype(np.int64))
-                below = self.index.children[below]
+            below = np.array([key])
+            while below.size:
+                below = self.index.children[below[self.index.known[below]]]
+                below = below[below >= 0].astype(np.int64)
+                self._bereave(below)
         return True
 
     def family(self, node: int) -> dict[int, Cloud | Corrupt] | int:

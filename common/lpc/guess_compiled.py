@@ -41,7 +41,8 @@ def take(parts: Sequence[Part], schema: Schema) -> Near:
     index = np.empty(most, np.int32)
     count = 0
     for cloud, low, high, away in parts:
-        begin, count = count, int(_inside(cloud.position, low, high, away, count, place, index))
+        begin = count
+        count = int(_inside(cloud.position, low, high, away, begin, place, index))
         row = 0
         for attribute in guessed:
             codes = cloud.codes[attribute.name]
@@ -92,7 +93,8 @@ def _inside(position: Any, low: Any, high: Any, away: Any, count: int, place: An
         # Written always and kept if it is inside: no branch to guess.
         place[0, count], place[1, count], place[2, count] = x + add_x, y + add_y, z + add_z
         index[count] = i
-        count += (np.uint32(x - low_x) <= size_x) & (np.uint32(y - low_y) <= size_y) & (np.uint32(z - low_z) <= size_z)
+        here = (np.uint32(x - low_x) <= size_x) & (np.uint32(y - low_y) <= size_y) & (np.uint32(z - low_z) <= size_z)
+        count += int(here)
     return count
 
 
