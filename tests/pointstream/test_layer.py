@@ -128,6 +128,23 @@ def test_an_urgent_cloud_overtakes_the_bulk(large_model: bytes) -> None:
         over_line(large_model, check)
 
 
+@pytest.mark.parametrize("most_orphans", [0, 4 << 20])
+def test_clouds_that_come_before_their_ancestors(most_orphans: int, model: bytes) -> None:
+    """Wants upside down and soon forgotten: whatever is kept of it, all comes in the end."""
+
+    async def check(layer: AccessLayer, origin: Origin) -> None:
+        draw = np.random.default_rng(2)
+        for _ in range(40):
+            wants = draw.permutation(np.flatnonzero(~layer.resident))[:3]
+            layer.end_frame(wants, pinned=np.flatnonzero(layer.resident))
+            await asyncio.sleep(FRAME)
+        await fill(layer)
+        assert layer.resident.all()
+        check_clouds(layer, model)
+
+    over_line(model, check, most_orphans=most_orphans)
+
+
 def test_a_camera_that_jumps_wastes_little_of_the_line(large_model: bytes) -> None:
     """Every 100 ms the view is elsewhere: 30 wants of one region, all others forgotten."""
 
