@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lpc.density import Density
 from pointview.budget import allowance
 from pointview.camera import Camera
 from pointview.refine import refine
@@ -50,20 +51,24 @@ def sphere_index() -> Any:
     children = np.stack([2 * numbers + 1, 2 * numbers + 2], axis=1)
     children[children >= nodes] = -1
     levels = np.concatenate(level)
-    return SimpleNamespace(
+    index = SimpleNamespace(
         header=SimpleNamespace(nodes=nodes, page_nodes=1024, bounds=(-1, -1, -1, 1, 1, 1)),
         known=np.ones(nodes, dtype=bool),
         center=np.concatenate(center),
         radius=np.concatenate(radius),
         spacing=np.sqrt(4 * np.pi / CLOUD_SIZE / (2.0 ** (levels + 1) - 1)),
         samples=np.full(nodes, CLOUD_SIZE),
+        subtree=CLOUD_SIZE * (2 ** (LEVELS - levels) - 1),
         size=np.full(nodes, 5000),
         cone_axis=np.concatenate(axis).astype(np.float32),
         cone_angle=np.concatenate(angle).astype(np.float32),
         children=children.astype(np.int32),
         parent=np.where(numbers > 0, (numbers - 1) // 2, -1).astype(np.int32),
         level=levels.astype(np.uint8),
+        density=Density(nodes),
     )
+    index.density.add(index, [np.flatnonzero(levels == depth) for depth in range(LEVELS)])
+    return index
 
 
 def _interleaved(depth: int) -> Any:

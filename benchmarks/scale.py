@@ -120,8 +120,8 @@ def requests_to_open(model: Path) -> int:
 
 
 def stream(model: Path, report: Path) -> dict[str, Any]:
-    options = ["--link", "adsl", "--clock", "virtual", "--seconds", "30", "--report", str(report), "--json"]
-    found: dict[str, Any] = json.loads(run([*COMMAND, "stream", model, *options]))
+    options = ["--link", "adsl", "--clock", "virtual", "--seconds", "30", "--occlusion", "auto", "--json"]
+    found: dict[str, Any] = json.loads(run([*COMMAND, "stream", model, *options, "--report", report]))
     return found
 
 

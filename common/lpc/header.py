@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 MAGIC = b"\x89LPC\r\n\x1a\n"
 MAJOR, MINOR = 1, 0
 HEADER_PROBE = 65536  # bytes of the first read: header, first page and first clouds
+PART_SUFFIX = (
+    ".present"  # of a file beside a copy of which only parts are here: it says which, and the copy is no model alone
+)
 MAX_TEXT = 49_152  # leaves a quarter of the probe to the first page and clouds
 
 _OBJECTS = ("left_out", "rejected", "bits_per_sample", "attribute_bits")

@@ -22,7 +22,7 @@ import numpy as np
 from lpc.codec import decode_cloud, near_box, samples_to_points
 from lpc.context import ANCESTORS, has_context, with_ancestors
 from lpc.errors import BuildError, FormatError
-from lpc.header import HEADER_PROBE, parse_header
+from lpc.header import HEADER_PROBE, PART_SUFFIX, parse_header
 from lpc.index import IndexTree
 from lpc.points import PointBatch
 
@@ -102,7 +102,8 @@ class OldModel:
                 f"{path} was built before models could be added to: build it anew of its scans and the others"
             )
         with _told(path), path.open("rb") as file:
-            if os.fstat(file.fileno()).st_size != header.bytes:
+            whole = os.fstat(file.fileno()).st_size == header.bytes
+            if not whole or path.with_name(path.name + PART_SUFFIX).exists():
                 raise BuildError(f"{path} is not whole: it should have {header.bytes:,} bytes; fetch or copy it again")
             index = IndexTree(header)
             for page in range(header.pages):

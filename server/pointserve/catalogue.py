@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lpc.errors import FormatError
-from lpc.header import HEADER_PROBE, Header, parse_header
+from lpc.header import HEADER_PROBE, PART_SUFFIX, Header, parse_header
 
 from .files import names_inside
 from .paths import MAX_DEPTH, MODEL_SUFFIX, is_plain_name, url_path
@@ -145,8 +145,9 @@ def _model_files(root: Path) -> Iterator[tuple[tuple[str, ...], os.stat_result]]
             if not names:
                 raise
             continue
+        here = {entry.name for entry in entries}
         for entry in entries:
-            if not is_plain_name(entry.name):
+            if not is_plain_name(entry.name) or entry.name + PART_SUFFIX in here:
                 continue
             try:
                 if entry.is_dir(follow_symlinks=False) and len(names) + 2 <= MAX_DEPTH:

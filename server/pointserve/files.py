@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
 from lpc.errors import FormatError, NotFound, Unavailable
-from lpc.header import HEADER_PROBE, parse_header
+from lpc.header import HEADER_PROBE, PART_SUFFIX, parse_header
 
 from .paths import MODEL_SUFFIX, content_type, is_plain_name
 from .preconditions import FileFacts
@@ -182,6 +182,8 @@ class FileStore:
             known.retire()
 
     def _open_file(self, names: tuple[str, ...], now: float) -> OpenFile:
+        if self.root.joinpath(*names[:-1], names[-1] + PART_SUFFIX).exists():
+            raise NotFound(f"{names[-1]} is the copy of a part; complete it with `pointstream fetch`")
         file = io.FileIO(self._descriptor(names), "rb")
         try:
             status = os.fstat(file.fileno())

@@ -272,6 +272,14 @@ def test_models_that_cannot_be_added_to(damage: Any, why: str, tmp_path: Path) -
     assert {path.name for path in tmp_path.iterdir()} <= {"m.lpc"}
 
 
+def test_the_copy_of_a_part_cannot_be_added_to(tmp_path: Path) -> None:
+    model = tmp_path / "m.lpc"
+    built([SURFACE], model)
+    (tmp_path / "m.lpc.present").write_bytes(b"which parts are here")
+    with pytest.raises(BuildError, match="is not whole"):
+        built([SURFACE], tmp_path / "other.lpc", model)
+
+
 def test_another_build_of_the_model_runs(tmp_path: Path) -> None:
     model = tmp_path / "m.lpc"
     built([SURFACE], model)

@@ -86,6 +86,17 @@ class Text(HTMLParser):
         self.text += data
 
 
+async def test_the_copy_of_a_part_is_not_served(models: Path, model: WriteModel) -> None:
+    data = model()
+    (models / "david.lpc.present").write_bytes(b"which parts are here")
+    async with serve_in_loop(models) as url, RawConnection(url) as connection:
+        assert await listed(connection) == {}
+        assert (await connection.ask("/david.lpc", "Range: bytes=0-9")).status == 404
+        (models / "david.lpc.present").unlink()  # the rest has come
+        assert list(await listed(connection)) == ["david.lpc"]
+        assert (await connection.ask("/david.lpc", "Range: bytes=0-9")).body == data[:10]
+
+
 async def test_page_has_the_facts_a_link_and_a_line_to_copy(models: Path, model: WriteModel) -> None:
     model("a folder/<script>alert(1)&.lpc")
     async with serve_in_loop(models) as url, RawConnection(url) as connection:

@@ -22,6 +22,7 @@ import threading
 import zlib
 from typing import TYPE_CHECKING
 
+from lpc.header import PART_SUFFIX
 from lpc.ranges import ByteRange
 
 from .presence import Presence
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-SUFFIX = ".present"
 MAGIC = b"LPCMAP\x01\n"
 HEAD = struct.Struct("<8sQ8s")
 RECORD = struct.Struct("<QQII")
@@ -44,7 +44,7 @@ SLACK = 1024
 
 def map_path(path: Path) -> Path:
     """Where the map of a file stands."""
-    return path.with_name(path.name + SUFFIX)
+    return path.with_name(path.name + PART_SUFFIX)
 
 
 class SparseFile:

@@ -29,9 +29,10 @@ from pointlink.front import parse_upstream, precise_loop, serve_front
 from pointlink.memory import Network
 from pointlink.origin import Origin, serve_origin
 from pointlink.resources import Resource
-from pointstream.stores import LocalStore, Store, is_address
+from pointstream.stores import Store, is_address, open_store
 from pointstream.stores.dialling import OneConnection
 from pointstream.stores.http import HttpStore
+from pointstream.stores.sparse import map_path
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Awaitable, Callable
@@ -82,6 +83,11 @@ async def open_link(target: str, profile: Profile, kind: ClockKind) -> AsyncIter
     """
     clock = asyncio.get_running_loop().time
     free = profile.down_rate is None and profile.up_rate is None and profile.rtt == 0.0
+    unlinked = free and kind == "real"
+    if not unlinked and not is_address(target) and map_path(Path(target)).is_file():
+        raise StoreError(
+            f"{target} is the copy of a part: complete it with `pointstream fetch`, or use --link none --clock real"
+        )
     async with AsyncExitStack() as stack:
         if kind == "virtual":
             resource = _remote_resource(target, stack) if is_address(target) else Resource.from_path(Path(target))
@@ -92,8 +98,8 @@ async def open_link(target: str, profile: Profile, kind: ClockKind) -> AsyncIter
                 clock=clock,
                 transports=lambda: OneConnection(backend=network, keep_alive=None),
             )
-        elif free:
-            yield (lambda: HttpStore(target, clock=clock)) if is_address(target) else lambda: LocalStore(Path(target))
+        elif unlinked:
+            yield lambda: open_store(target, clock=clock)
         else:
             address = target
             if not is_address(target):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import signal
@@ -13,6 +14,9 @@ import pytest
 from support.frames import whole_index
 
 from pointstream.command import run as command
+from pointstream.fetch import FetchOptions, fetch
+from pointstream.reading import Region
+from pointstream.stores import LocalStore
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 ROOMS = os.pathsep.join(str(REPOSITORY / room) for room in ("common", "server", "client"))
@@ -137,6 +141,22 @@ def test_an_interrupt_is_one_line(endless, tmp_path):
         rest = process.stderr.read()
     assert process.returncode == 130
     assert rest.split("\n") in (["", "pointstream: interrupted", ""], ["pointstream: interrupted", ""])
+
+
+@pytest.mark.parametrize("clock", ["real", "virtual"])
+def test_the_copy_of_a_part(small, tmp_path, capsys, clock):
+    """No host serves one; without a link what is here is shown, and no gap taken for damage."""
+    asked = Region(level=1)
+
+    async def fetch_part():
+        return await fetch(LocalStore(Path(small)), tmp_path / "part.lpc", FetchOptions(region=asked))
+
+    assert not asyncio.run(fetch_part()).complete
+    assert run(tmp_path / "part.lpc", *given(tmp_path / "report", clock=clock)) == 1
+    assert "is the copy of a part" in capsys.readouterr().err
+    if clock == "real":
+        assert run(tmp_path / "part.lpc", *given(tmp_path / "report", clock=clock, link="none"), "--json") == 0
+        assert json.loads(capsys.readouterr().out)["errors"] == []
 
 
 def test_damage_is_told_also_where_the_comparison_lacks_it(small, tmp_path, capsys):
