@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import signal
+import sys
 from typing import TYPE_CHECKING
 
 import click
@@ -54,9 +54,8 @@ def link(upstream: Upstream, profile: Profile, host: str, port: int) -> None:
 async def _serve(upstream: Upstream, profile: Profile, host: str, port: int) -> None:
     stopped = asyncio.Event()
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        # Where the loop has no signal handlers (Windows) the interrupt ends asyncio.run.
-        with contextlib.suppress(NotImplementedError):
+    if sys.platform != "win32":  # its loops have no signal handlers: there the interrupt ends the runner
+        for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, stopped.set)
     await check_upstream(upstream)
     async with await serve_front(upstream, profile, host=host, port=port) as front:

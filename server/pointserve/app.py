@@ -179,7 +179,8 @@ def _origin(request: web.Request) -> str:
 async def _finish_fields(request: web.Request, response: web.StreamResponse) -> None:
     headers = response.headers
     headers["Server"] = "pointstream"
-    headers["X-Content-Type-Options"] = "nosniff"
+    if response.status != 206:  # a part is no page; on a slow line each byte of its head delays a cloud
+        headers["X-Content-Type-Options"] = "nosniff"
     request.app[SERVICE].cors.apply(request.headers.get("Origin"), headers)
 
 

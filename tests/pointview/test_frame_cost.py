@@ -51,18 +51,21 @@ def cut_of(model, nodes):
 
 
 def calls(work):
-    """Calls of Python and of C functions that some work makes."""
+    """Calls of Python and of C functions that some work makes, a garbage collection's callbacks and finalizers apart."""
     count = 0
 
     def seen(frame, event, argument):
         nonlocal count
         count += event in ("call", "c_call")
 
+    gc.collect()
+    gc.disable()
     sys.setprofile(seen)
     try:
         work()
     finally:
         sys.setprofile(None)
+        gc.enable()
     return count
 
 
