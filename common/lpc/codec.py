@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import threading
-from collections.abc import Callable
 from functools import cache
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal, Protocol
@@ -48,7 +47,6 @@ if TYPE_CHECKING:
 
 Effort = Literal["default", "best", "fast"]
 Engine = Literal["auto", "numpy", "compiled"]
-Known = Callable[[int, "Sequence[Cloud]"], bytes | None]
 
 
 WINDOWS: dict[Effort, int] = {"default": 64, "best": 64, "fast": 16}
@@ -177,8 +175,7 @@ def encode_clouds(
     schema: Schema,
     *,
     parent: NDArray[np.int64] | None = None,
-    first: int = 0,
-    known: Known | None = None,
+    wanted: NDArray[np.bool_] | None = None,
     effort: Effort = "default",
     engine: Engine = "auto",
 ) -> list[bytes]:
@@ -190,45 +187,32 @@ def encode_clouds(
     ----------
     parent : ndarray, (n,) int64, optional
         Number of each cloud's parent among these, always a smaller one; -1 for none.
-    first : int
-        Clouds before it are only there as context: their frames are left out.
-    known : callable, optional
-        ``known(i, context)`` gives the frame of cloud `i` if it is known without encoding, else None.
+    wanted : ndarray, (n,) bool, optional
+        Clouds whose frames are given; the others are only context. All, if not given.
     """
     writer = _Writer(lattice, codes, bounds, schema, effort, engine)
     above = [-1] * (len(bounds) - 1) if parent is None else parent.tolist()
-    inner = set(above)
+    give = [True] * len(above) if wanted is None else wanted.tolist()
+    lines = {number: _line(above, number) for number, given in enumerate(give) if given}
+    inner = {up for line in lines.values() for up in line}
     clouds: dict[int, Cloud] = {}
     frames = []
     for number, (begin, end) in enumerate(itertools.pairwise(np.asarray(bounds).tolist())):
-        line: list[Cloud] = []
-        up = above[number]
-        while up >= 0 and len(line) < ANCESTORS and number >= first:
-            line.append(clouds[up])
-            up = above[up]
-        context = line[::-1]
-        frame = known(number, context) if known and number >= first else None
-        if frame is None or number in inner:
+        if number in inner or give[number]:
             placed = writer.place(begin, end)
             if number in inner:
                 clouds[number] = writer.known(placed)
-            if number >= first and frame is None:
-                frame = writer.frame(placed, context)
-        if frame is not None:
-            frames.append(frame)
+            if give[number]:
+                frames.append(writer.frame(placed, [clouds[up] for up in lines[number]]))
     return frames
 
 
-def near_box(clouds: Sequence[Cloud], schema: Schema, low: NDArray[np.int64], high: NDArray[np.int64]) -> Near | None:
-    """Give the samples that ancestors have in a box of the lattice, faces included.
-
-    They tell the context of a cloud of that box, but for one that keeps low bits apart: of so large boxes, None.
-    """
-    x, y, z = low.tolist()
-    if (high - low).max() >= 1 << TOP_BITS:
-        return None
-    box = np.stack([low - low, high - low]).astype(np.uint16)
-    return select(clouds, schema, corner=(x, y, z), shift=0, position=box, engine=_codec("auto"))
+def _line(parent: list[int], number: int) -> list[int]:
+    """Nearest ancestors of a cloud, from the root down."""
+    line = [number]
+    while len(line) <= ANCESTORS and parent[line[-1]] >= 0:
+        line.append(parent[line[-1]])
+    return line[:0:-1]
 
 
 class _Writer:

@@ -105,12 +105,13 @@ def encode_run(
     lattice, owner, codes = _read(family, bounds, nodes, regions, schema)
     place = np.searchsorted(family, nodes.parent[family])
     parent = np.where(family[place] == nodes.parent[family], place, -1)
-    copies = None if old is None else old.copies(lattice, owner, bounds, before)
-    frames = encode_clouds(
-        lattice, codes, bounds, schema, parent=parent, first=before, effort=effort,
-        known=None if copies is None else copies.frame,
-    )  # fmt: skip
-    kept = 0 if copies is None else copies.count
+    found = np.full(len(family), -1) if old is None else old.find(owner, bounds, parent)
+    found[:before] = -1
+    fresh = (np.arange(len(family)) >= before) & (found < 0)
+    written = iter(encode_clouds(lattice, codes, bounds, schema, parent=parent, wanted=fresh, effort=effort))
+    copied = iter([] if old is None else old.frames(found[found >= 0]))
+    frames = [next(written if new else copied) for new in fresh[before:].tolist()]
+    kept = len(frames) - int(fresh.sum())
     own = int(bounds[before])
     lattice, bounds = lattice[own:], bounds[before:] - own
     shape = (stop - first, int(nodes.depth[first:stop].max()) + 1)
