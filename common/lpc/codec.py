@@ -17,7 +17,7 @@ import zstandard
 
 from .channels import Channels, channels_of, from_channels, to_channels
 from .cloud import Cloud
-from .context import ANCESTORS, Near, Part, Place, select
+from .context import Near, Part, Place, line_of, select
 from .errors import Corrupt
 from .lattice import dequantise
 from .octahedral import decode_normals
@@ -164,8 +164,8 @@ def encode_cloud(
     ValueError
         If arguments are out of these ranges.
     """
-    writer = _Writer(lattice, codes, np.array([0, len(lattice)]), schema, effort, engine)
-    return writer.frame(writer.place(0, len(lattice)), context)
+    writer = CloudWriter(lattice, codes, np.array([0, len(lattice)]), schema, effort=effort, engine=engine)
+    return writer.frame(writer.place(0), context)
 
 
 def encode_clouds(
@@ -175,7 +175,6 @@ def encode_clouds(
     schema: Schema,
     *,
     parent: NDArray[np.int64] | None = None,
-    wanted: NDArray[np.bool_] | None = None,
     effort: Effort = "default",
     engine: Engine = "auto",
 ) -> list[bytes]:
@@ -187,36 +186,28 @@ def encode_clouds(
     ----------
     parent : ndarray, (n,) int64, optional
         Number of each cloud's parent among these, always a smaller one; -1 for none.
-    wanted : ndarray, (n,) bool, optional
-        Clouds whose frames are given; the others are only context. All, if not given.
     """
-    writer = _Writer(lattice, codes, bounds, schema, effort, engine)
+    writer = CloudWriter(lattice, codes, bounds, schema, effort=effort, engine=engine)
     above = [-1] * (len(bounds) - 1) if parent is None else parent.tolist()
-    give = [True] * len(above) if wanted is None else wanted.tolist()
-    lines = {number: _line(above, number) for number, given in enumerate(give) if given}
-    inner = {up for line in lines.values() for up in line}
+    inner = set(above)
     clouds: dict[int, Cloud] = {}
     frames = []
-    for number, (begin, end) in enumerate(itertools.pairwise(np.asarray(bounds).tolist())):
-        if number in inner or give[number]:
-            placed = writer.place(begin, end)
-            if number in inner:
-                clouds[number] = writer.known(placed)
-            if give[number]:
-                frames.append(writer.frame(placed, [clouds[up] for up in lines[number]]))
+    for number in range(len(above)):
+        placed = writer.place(number)
+        frames.append(writer.frame(placed, [clouds[up] for up in line_of(number, above)]))
+        if number in inner:
+            clouds[number] = writer.cloud(placed)
     return frames
 
 
-def _line(parent: list[int], number: int) -> list[int]:
-    """Nearest ancestors of a cloud, from the root down."""
-    line = [number]
-    while len(line) <= ANCESTORS and parent[line[-1]] >= 0:
-        line.append(parent[line[-1]])
-    return line[:0:-1]
+class CloudWriter:
+    """Encodes clouds that stand one after another, in any order; for one thread.
 
-
-class _Writer:
-    """What encodes the clouds of one batch."""
+    Parameters
+    ----------
+    lattice, codes, bounds, schema, effort, engine
+        As of `encode_clouds`.
+    """
 
     def __init__(
         self,
@@ -224,11 +215,13 @@ class _Writer:
         codes: Mapping[str, NDArray[Any]],
         bounds: NDArray[np.int64],
         schema: Schema,
-        effort: Effort,
-        engine: Engine,
+        *,
+        effort: Effort = "default",
+        engine: Engine = "auto",
     ) -> None:
         lattice = np.ascontiguousarray(lattice, np.int64)
-        for begin, end in itertools.pairwise(np.asarray(bounds).tolist()):
+        self._bounds = np.asarray(bounds).tolist()
+        for begin, end in itertools.pairwise(self._bounds):
             if not 1 <= end - begin <= MAX_SAMPLES or not 0 <= begin < end <= len(lattice):
                 raise ValueError(
                     f"a cloud of samples {begin} to {end} of {len(lattice)}: 1 to {MAX_SAMPLES} are allowed"
@@ -242,14 +235,14 @@ class _Writer:
         # Faster strategies reuse another stream's Huffman codes in blocks up to 1 KiB, which takes up to 20 % more.
         self._small = _contexts.compressor("default" if effort == "fast" else effort)
 
-    def place(self, begin: int, end: int) -> Placed:
+    def place(self, number: int) -> Placed:
         """Put the samples of a cloud in order."""
-        placed = self._codec.arrange(self._lattice, self._rows, begin, end)
+        placed = self._codec.arrange(self._lattice, self._rows, self._bounds[number], self._bounds[number + 1])
         if placed.nbits > TOP_BITS or placed.shift > MAX_SHIFT:
             raise ValueError(f"a cloud spans 2**{placed.nbits + placed.shift} steps, 2**48 are the most")
         return placed
 
-    def known(self, placed: Placed) -> Cloud:
+    def cloud(self, placed: Placed) -> Cloud:
         """Give a cloud as context of others, as it will be decoded: with normals and colours only."""
         low = None
         if placed.shift:
@@ -258,7 +251,7 @@ class _Writer:
         return Cloud(origin=placed.corner, position=placed.position, shift=placed.shift, low=low, codes=codes)
 
     def frame(self, placed: Placed, context: Sequence[Cloud]) -> bytes:
-        """Write a cloud."""
+        """Encode a cloud; `context` as of `encode_cloud`."""
         near = None
         if context and len(self._channels.guessed):
             x, y, z = placed.corner.tolist()

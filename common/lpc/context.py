@@ -32,6 +32,14 @@ def has_context(schema: Schema) -> bool:
     return any(attribute.kind != "scalar" for attribute in schema)
 
 
+def line_of(number: int, parent: Sequence[int] | NDArray[Any]) -> list[int]:
+    """Nearest ancestors of a node, from the root down; a root's parent is -1."""
+    line = [number]
+    while len(line) <= ANCESTORS and parent[line[-1]] >= 0:
+        line.append(int(parent[line[-1]]))
+    return line[:0:-1]
+
+
 def with_ancestors(nodes: NDArray[np.int64], parent: NDArray[Any], generations: int) -> NDArray[np.int64]:
     """Give nodes and their nearest ancestors, each once, parents first.
 

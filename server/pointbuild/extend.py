@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lpc.codec import decode_cloud, samples_to_points
-from lpc.context import ANCESTORS, has_context
+from lpc.context import ANCESTORS, has_context, line_of
 from lpc.errors import BuildError, FormatError
 from lpc.header import HEADER_PROBE, PART_SUFFIX, parse_header
 from lpc.index import IndexTree
@@ -189,18 +189,13 @@ class OldModel:
             for node in nodes:
                 if node not in found:
                     frame, samples = self.frame(file, node), int(self.index.samples[node])
-                    context = [clouds[above] for above in self._line(node)]
+                    context = [clouds[above] for above in self.line(node)]
                     found[node] = decode_cloud(frame, samples=samples, schema=schema, context=context)
         return found
 
-    def _line(self, node: int) -> list[int]:
+    def line(self, node: int) -> list[int]:
         """Nodes that tell a cloud, from the root down."""
-        if not has_context(self.header.attributes):
-            return []
-        line = [node]
-        while len(line) <= ANCESTORS and (above := int(self.index.parent[line[-1]])) >= 0:
-            line.append(above)
-        return line[:0:-1]
+        return line_of(node, self.index.parent) if has_context(self.header.attributes) else []
 
     def frame(self, file: int, node: int) -> bytes:
         """Bytes of a cloud, checked."""
@@ -312,13 +307,8 @@ class OldClouds:
 
     model: OldModel
 
-    def find(
-        self, owner: NDArray[np.uint32], bounds: NDArray[np.int64], parent: NDArray[np.int64]
-    ) -> NDArray[np.int64]:
-        """Old cloud that each cloud is, -1: none.
-
-        It is one if its samples are those of the old cloud, and those of its nearest ancestors are those of the old
-        cloud's: then it is told from the same.
+    def find(self, owner: NDArray[np.uint32], bounds: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Old cloud that has the samples of each cloud, and no others; -1: none.
 
         Parameters
         ----------
@@ -326,33 +316,23 @@ class OldClouds:
             `OWNER` of all samples.
         bounds : ndarray, (k + 1,) int64
             Cloud i is the samples ``bounds[i]`` to ``bounds[i + 1]``.
-        parent : ndarray, (k,) int64
-            Number of each cloud's parent among these; -1 for none.
         """
-        index, starts = self.model.index, bounds[:-1]
+        starts = bounds[:-1]
         number = owner[starts].astype(np.int64) - 1
         one = np.minimum.reduceat(owner, starts) == np.maximum.reduceat(owner, starts)
-        same = np.where(one & (number >= 0) & (index.samples[number] == np.diff(bounds)), number, -1)
-        found = same
-        if has_context(self.model.header.attributes):
-            above, old = np.arange(len(same)), same
-            for _ in range(ANCESTORS):
-                above, old = _up(parent, above), _up(index.parent, old)
-                found = np.where(np.where(above < 0, -1, same[above]) == old, found, -1)
-        return found
+        return np.where(one & (number >= 0) & (self.model.index.samples[number] == np.diff(bounds)), number, -1)
 
-    def frames(self, nodes: NDArray[np.int64]) -> list[bytes]:
-        """Bytes of old clouds."""
+    def stays(self, number: int, line: list[int]) -> bool:
+        """Whether a cloud that is old cloud `number`, and whose ancestors are those of `line`, has the same bytes."""
+        return number >= 0 and self.model.line(number) == line
+
+    def frame(self, number: int) -> bytes:
+        """Bytes of an old cloud."""
         file = os.open(self.model.path, os.O_RDONLY | os.O_CLOEXEC)
         try:
-            return [self.model.frame(file, node) for node in nodes.tolist()]
+            return self.model.frame(file, number)
         finally:
             os.close(file)
-
-
-def _up(parent: NDArray[Any], nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Parents of nodes; -1 above the root."""
-    return np.where(nodes < 0, -1, parent[nodes])
 
 
 def read_header(path: Path) -> Header:
