@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lpc.context import line_of
 from lpc.errors import Corrupt, FormatError, LpcError, ModelChanged, StoreError, Unavailable
 from lpc.header import HEADER_PROBE
 from lpc.ranges import ByteRange
@@ -120,7 +121,11 @@ class Traffic:
         """
         keys, starts, stops, held = build.places(pages, nodes)
         self.local.offer(keys[held], starts[held], stops[held])
-        self.scheduler.offer(keys[~held], starts[~held], stops[~held])
+        line = 0  # the first want may wait for its ancestors: what these bring along would delay it
+        while line + 1 < len(nodes) and nodes[line] in line_of(int(nodes[line + 1]), build.index.parent):
+            line += 1
+        alone = nodes[: line + 1] if line else None
+        self.scheduler.offer(keys[~held], starts[~held], stops[~held], alone=alone)
         self.issue()
 
     def offer_ahead(self, build: Build, pages: NDArray[np.int64], nodes: NDArray[np.int64]) -> None:
