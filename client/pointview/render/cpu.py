@@ -100,8 +100,9 @@ class CpuBackend:
             largest = min(splats.LARGEST_HOLE, math.ceil(splats.HOLE * side.max()))
             top, bottom = rows(worker)
             found = picture_kernels.close_holes(
-                depth, side, holes, sources, top, bottom, camera.focal, splats.HOLE, largest, splats.WALLS
-            )
+                depth, side, holes, sources, top, bottom, camera.focal,
+                splats.HOLE, largest, splats.WALLS, splats.FACES, splats.FACE,
+            )  # fmt: skip
             return slice(top * camera.width, top * camera.width + found)
 
         self._in_parallel(splat)

@@ -391,7 +391,7 @@ def _shader(name: str, defines: str = "") -> str:
 
     def constant(match: re.Match[str]) -> str:
         value = constants[match[1]]
-        return str(value) if match[1] in ("WALLS", "LARGEST_HOLE") else f"{float(value):.9e}"
+        return str(value) if match[1] in ("WALLS", "FACES", "LARGEST_HOLE") else f"{float(value):.9e}"
 
     return f"#version 330\n{defines}{kinds}{re.sub('@([A-Z_]+)@', constant, text)}"
 

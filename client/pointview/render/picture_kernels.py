@@ -80,6 +80,8 @@ def close_holes(
     reach: float,
     largest: int,
     walls: int,
+    faces: int,
+    face: float,
 ) -> int:  # pragma: no cover - compiled
     """Find the pixels of the rows `top` to `bottom` that lie in holes, and the walls that they show instead.
 
@@ -94,6 +96,8 @@ def close_holes(
         And at most this many pixels.
     walls : int
         Directions, of eight, in which a hole has walls.
+    faces, face : int, float
+        In so many of these a wall goes on into the hole, by its slope over so many sides of its splat.
 
     Returns
     -------
@@ -105,9 +109,9 @@ def close_holes(
     for row in range(top, bottom):
         for column in range(width):
             here = depth[row, column]
-            best, nearest, found = row * width + column, largest + 1, 0
+            best, nearest, found, level = row * width + column, largest + 1, 0, 0
             for direction in range(8):
-                if found + 8 - direction < walls:
+                if found + 8 - direction < walls or level + 8 - direction < faces:
                     break
                 dx, dy = DIRECTIONS[direction]
                 step = 1
@@ -120,11 +124,19 @@ def close_holes(
                         wide = side[y, x]
                         if step <= max(F(reach) * wide, F(1.0)) and wall * (F(1.0) + wide / F(focal)) < here:
                             found += 1
-                            if step < nearest:
-                                nearest, best = step, y * width + x
+                            ahead = max(int(F(face) * wide + F(0.5)), 1)
+                            x_ahead, y_ahead, slope = x + ahead * dx, y + ahead * dy, F(0.0)
+                            if x_ahead >= 0 and x_ahead < width and y_ahead >= 0 and y_ahead < height:
+                                slope = (depth[y_ahead, x_ahead] / wall - F(1.0)) * F(focal) / F(ahead)
+                                slope = slope if slope < np.inf else F(0.0)
+                            away = F(step * step) * (F(dx * dx + dy * dy) + slope * slope)
+                            if step == 1 or away <= F(reach) * wide * F(reach) * wide:
+                                level += 1
+                                if step < nearest:
+                                    nearest, best = step, y * width + x
                             break
                     step += 1 if step < 4 else step // 2
-            if found >= walls:
+            if found >= walls and level >= faces:
                 holes[count], sources[count] = row * width + column, best
                 count += 1
     return count - first
