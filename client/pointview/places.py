@@ -42,6 +42,10 @@ class Places:
     spacing : (n + m, 2) float32
         Spacing to close in each half, model units; the largest of it where a link goes deeper. Negative in a half
         that ends here because its node is missing.
+    spread : (n + m,) float32
+        How much further apart samples are where a half of the row ends than all of the model's would be.
+    alone : (n,) float32
+        The inverse of that for the samples of the node alone: `render.thin` knows how far apart these are.
     corner : (n, 3) float64
         Lowest corner of the node's cell, model space.
     level : (n,) int32
@@ -54,6 +58,8 @@ class Places:
 
     link: NDArray[np.int32]
     spacing: NDArray[np.float32]
+    spread: NDArray[np.float32]
+    alone: NDArray[np.float32]
     corner: NDArray[np.float64]
     level: NDArray[np.int32]
     axis: NDArray[np.int32]
@@ -88,6 +94,7 @@ def places(
     own: Sequence[NDArray[np.float64]],
     shown: Sequence[NDArray[np.float64]],
     below: Below,
+    alone: NDArray[np.float64],
 ) -> Places:
     """Lay out the drawn nodes, level by level.
 
@@ -99,6 +106,8 @@ def places(
         Each node's own spacing and the largest shown around its samples.
     below : Below
         What the index says of the halves without a drawn node.
+    alone : (n,) float64
+        See `Places`.
     """
     axes, halves = halvings(header, len(drawn) + below.levels)
     corner = np.array([header.bounds[:3]], dtype=np.float64)
@@ -124,6 +133,8 @@ def places(
     return Places(
         link=np.concatenate([*links, below.link[row:]]),
         spacing=np.concatenate([*spacings, below.spacing[row:]]).astype(np.float32),
+        spread=below.spread.astype(np.float32),
+        alone=alone.astype(np.float32),
         corner=np.concatenate(corners),
         level=np.concatenate(levels).astype(np.int32),
         axis=axes,

@@ -257,7 +257,7 @@ def refine(
         below = look_below(index, camera, nodes, np.concatenate(drawn), np.concatenate(missing))
         shown = _shown_spacing(levels, own, below.spacing)
         spacing = np.concatenate(shown)
-        laid_out = places(index.header, drawn, missing, own, shown, below)
+        laid_out = places(index.header, drawn, missing, own, shown, below, np.sqrt(index.density.own[nodes]))
     # A splat at the nearest point of the sphere; without bound but the largest where the eye is inside it.
     splat_px = np.ones(len(nodes))
     grown = spacing > 0

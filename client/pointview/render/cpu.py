@@ -18,7 +18,7 @@ from .arena import Arena
 from .backend import Frame, Style, Take
 from .blending import blend, linear_light
 from .pack import Packer
-from .seen import place_table
+from .seen import alone, place_table
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -81,7 +81,7 @@ class CpuBackend:
             self._layers[worker] = rules.EMPTY
             # Every `threads`-th cloud: neighbours in the array are neighbours in space, and cost alike.
             mine = np.ascontiguousarray(clouds[worker :: self._threads])
-            splat_kernels.splat(self._layers[worker], words, mine, places, halvings, rotation, view)
+            splat_kernels.splat(self._layers[worker], words, colors, mine, places, halvings, rotation, view)
 
         def rows(worker: int) -> tuple[int, int]:
             return camera.height * worker // self._threads, camera.height * (worker + 1) // self._threads
@@ -169,8 +169,11 @@ class CpuBackend:
         clouds["x"], clouds["y"], clouds["z"] = offset.T
         clouds["scale"] = self._arena.scale[slots]
         clouds["spacing"], clouds["starved"] = cut.spacing, cut.starved
-        clouds["row"], clouds["level"] = np.arange(len(slots)), -1
+        clouds["row"], clouds["level"], clouds["thin"] = np.arange(len(slots)), -1, False
+        clouds["alone"] = 0.0
         if cut.places is not None:
+            clouds["thin"] = self._arena.thin[slots]
+            clouds["alone"] = alone(cut.places, self._arena.scale[slots], slice(0, len(slots)))
             clouds["level"] = cut.places.level
             corner = self._arena.origin[slots] - cut.places.corner
             clouds["corner_x"], clouds["corner_y"], clouds["corner_z"] = corner.T

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pointview.camera import Camera
+    from pointview.places import Places
     from pointview.refine import Cut
 
 
@@ -23,9 +24,25 @@ def place_table(cut: Cut) -> tuple[NDArray[Any], NDArray[Any]]:
     places = np.empty(len(cut.places.link), dtype=PLACE)
     places["lower"], places["upper"] = cut.places.link.T
     places["lower_spacing"], places["upper_spacing"] = cut.places.spacing.T
+    places["spread"] = cut.places.spread
     halvings = np.empty(len(cut.places.axis), dtype=HALVING)
     halvings["axis"], halvings["half"] = cut.places.axis, cut.places.half
     return places, halvings
+
+
+def alone(places: Places, scale: NDArray[np.float64], part: slice) -> NDArray[np.float64]:
+    """Model units to a step of clouds of samples that show what all of the model's would: see `tables.CLOUD`.
+
+    Parameters
+    ----------
+    scale : (n,) float64
+        Model units to a step of the clouds.
+    part : slice
+        Which of the drawn nodes they are.
+    """
+    spread = places.spread[: len(places.level)][part]
+    uniform = np.where(places.level[part] < 0, spread, 1.0)  # there the kernels look up no place
+    return scale * places.alone[part] * uniform
 
 
 def pixels_by_cell(depth: NDArray[np.float32], cut: Cut, camera: Camera, *, stride: int = 1) -> NDArray[np.int64]:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+STEPS = 16
+"""Codes of `thin` to a doubling of the spacing."""
+
 CLOUD = np.dtype(
     [
         ("node", np.int32),
@@ -21,6 +24,8 @@ CLOUD = np.dtype(
         ("corner_x", np.float32),  # position of the cloud's (0, 0, 0) relative to the corner of its node's cell
         ("corner_y", np.float32),
         ("corner_z", np.float32),
+        ("thin", np.bool_),  # whether samples have a spacing of their own; see `thin`
+        ("alone", np.float32),  # model units of its step, times what `places` says of the node's own samples
     ]
 )
 """A cloud of the frame."""
@@ -31,6 +36,7 @@ PLACE = np.dtype(
         ("upper", np.int32),
         ("lower_spacing", np.float32),  # to close there; negative where starved
         ("upper_spacing", np.float32),
+        ("spread", np.float32),  # see `places`
     ]
 )
 """A drawn node (see `places`)."""

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 import numba
 import numpy as np
 
-from lpc.octahedral import decode_normals
-
 from .planes import box
+from .rules import direction
+from .tables import STEPS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -41,9 +41,14 @@ EDGE = 2.0
 """No quarter counts with more than this times the second nearest: it may face a rim of the surface."""
 THIN = 1.3
 """Spacing over the usual one of the cloud from which a sample is in a thin part."""
-STEPS = 16
-"""Codes to a doubling of the spacing."""
-
+BENT = 0.5
+"""Sine of the angle between a sample's plane and the way to a neighbour, and LIKE the cosine of that between their
+planes, up to which they are on one surface. Leaves and strays are not, and being alone they are no larger."""
+LIKE = 0.5
+AGREED = 2.0
+"""Most spacing of a sample over the second largest of those of its four neighbours."""
+TINY = 1e-9
+"""Spacing of a sample of no surface."""
 
 def thin(position: NDArray[np.uint16], normal: NDArray[np.uint16]) -> NDArray[np.uint8]:
     """Spacing of the cloud's samples around each of them, where it is thin.
@@ -76,18 +81,22 @@ def thin(position: NDArray[np.uint16], normal: NDArray[np.uint16]) -> NDArray[np
     pending = np.flatnonzero((company > 0) & (company < COMPANY) & (normal != 0))
     if not len(pending):
         return codes
-    bytes_of = normal[pending]
-    planes = decode_normals(np.stack([bytes_of & 0xFF, bytes_of >> 8], axis=1).astype(np.uint8))
-    apart = np.zeros(len(pending))
+    apart, around = np.zeros(len(pending)), np.full((len(pending), 4), -1)
     for grid in range(GRIDS):
         todo = np.flatnonzero(apart == 0.0)
         if not len(todo):
             break
         last = grid == GRIDS - 1 or side > max(extent)
-        apart[todo] = _apart(position, low, 1.0 / side, _shape(extent, side), pending[todo], planes[todo], EDGE, last)
+        apart[todo], around[todo] = _apart(
+            position, normal, low, 1.0 / side, _shape(extent, side), pending[todo], EDGE, BENT, LIKE, last
+        )
         if last:
             break
         side *= WIDER
+    # What is thin is so around its neighbours too, or it is a stray.
+    spacing = np.full(len(position) + 1, usual)
+    spacing[pending], spacing[-1] = apart, 0.0
+    apart = np.minimum(apart, AGREED * np.partition(spacing[around], 2, axis=1)[:, 2])
     found = apart > THIN * usual
     codes[pending[found]] = np.clip(np.rint(STEPS * np.log2(apart[found])), 1, 255)
     return codes
@@ -102,7 +111,7 @@ def _shape(extent: list[float], side: float) -> tuple[int, int, int]:
 def _company(
     position: NDArray[np.uint16], low: NDArray[np.float64], inverse: float, shape: tuple[int, int, int]
 ) -> NDArray[np.int32]:  # pragma: no cover - compiled
-    """Samples in the 27 cells around each sample; 0 for those outside the box."""
+    """Count the samples in the 27 cells around each sample; 0 for those outside the box."""
     nx, ny, nz = shape
     count = np.zeros(nx * ny * nz, np.int32)
     cell = np.empty(len(position), np.int32)
@@ -143,17 +152,20 @@ def _cell(
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def _apart(
     position: NDArray[np.uint16],
+    normal: NDArray[np.uint16],
     low: NDArray[np.float64],
     inverse: float,
     shape: tuple[int, int, int],
     pending: NDArray[np.int64],
-    planes: NDArray[np.float32],
     edge: float,
+    bent: float,
+    like: float,
     last: bool,
-) -> NDArray[np.float64]:  # pragma: no cover - compiled
-    """Spacing around the pending samples, 0 where a quarter of their plane holds no sample within a cell's side.
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:  # pragma: no cover - compiled
+    """Spacing around the pending samples and their neighbours, -1 for none; 0 where a quarter of their plane holds no sample within a cell's side.
 
-    Quarters that leave the box do not count: what is there is in other clouds. With `last`, no empty ones do.
+    Quarters that leave the box do not count: what is there is in other clouds. With `last`, no empty ones do. Tiny where
+    the nearest samples make no surface.
     """
     _, ny, nz = shape
     start = np.zeros(shape[0] * ny * nz + 1, np.int32)
@@ -176,10 +188,10 @@ def _apart(
                 lowest[axis] = min(lowest[axis], position[i, axis])
     side = 1.0 / inverse
     apart = np.zeros(len(pending))
-    nearest = np.empty(4)
+    nearest, around = np.empty(4), np.full((len(pending), 4), -1, np.int64)
     for p in range(len(pending)):
         i = pending[p]
-        nx, ny_, nz_ = planes[p, 0], planes[p, 1], planes[p, 2]
+        nx, ny_, nz_ = _unit(normal[i])
         # Two directions in the plane.
         if abs(nx) < 0.6:
             ux, uy, uz = 0.0, nz_, -ny_
@@ -201,7 +213,8 @@ def _apart(
                         continue
                     along, across = dx * ux + dy * uy + dz * uz, dx * vx + dy * vy + dz * vz
                     quarter = (1 if along > 0.0 else 0) + (2 if across > 0.0 else 0)
-                    nearest[quarter] = min(nearest[quarter], away)
+                    if away < nearest[quarter]:
+                        nearest[quarter], around[p, quarter] = away, j
         whole = True
         for quarter in range(4):
             if nearest[quarter] > side * side:
@@ -215,8 +228,18 @@ def _apart(
                     whole = False
                     break
                 if not inside:
-                    nearest[quarter] = np.inf
+                    nearest[quarter], around[p, quarter] = np.inf, -1
         if not whole:
+            continue
+        for quarter in range(4):
+            if nearest[quarter] < np.inf:
+                j = around[p, quarter]
+                rise = nx * (position[j, 0] - x) + ny_ * (position[j, 1] - y) + nz_ * (position[j, 2] - z)
+                ax, ay, az = _unit(normal[j])
+                alike = abs(nx * ax + ny_ * ay + nz_ * az) >= like and normal[j] != 0
+                whole = whole and alike and rise * rise <= bent * bent * nearest[quarter]
+        if not whole:
+            apart[p] = TINY
             continue
         nearest.sort()
         total, count = 0.0, 0
@@ -224,8 +247,18 @@ def _apart(
             if nearest[quarter] < np.inf:
                 total += min(nearest[quarter], edge * edge * nearest[min(1, quarter)])
                 count += 1
-        if count > 1:
+        if count > 2:
             apart[p] = math.sqrt(math.pi / 4.0 * total / count)
+        elif count > 0:  # at a corner of the box one distance says little: the lesser
+            apart[p] = math.sqrt(math.pi / 4.0 * nearest[0])
         elif last:
-            apart[p] = 1e-9
-    return apart
+            apart[p] = TINY
+    return apart, around
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
+def _unit(code: int) -> tuple[float, float, float]:  # pragma: no cover - compiled
+    """Return the normal of a code."""
+    a, b, c = direction(np.int32(code))
+    size = 1.0 / math.sqrt(a * a + b * b + c * c)
+    return a * size, b * size, c * size

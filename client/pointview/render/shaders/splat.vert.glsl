@@ -5,24 +5,27 @@
 // BLENDED: its shape is that of a kernel (see blend_kernels.gather).
 
 // vertex: x, y, z in steps; two octahedral bytes
-// color: 0 to 1
+// color: 0 to 1; the last of them says how far apart samples are in a thin part of the cloud (thin.py)
 // cloud_origin: offset of the cloud's (0, 0, 0) from the eye, axes of model space; model units of a step
 // cloud_corner: offset of the same from the corner of the node's cell; side of a splat, pixels times depth
 // cloud_numbers: node; its row among the places, + STARVED; its level, or -1: one spacing everywhere; samples
+// cloud_alone: model units of a step, times what places.py says of the node's own samples
 #ifdef COMMANDS
 in vec4 vertex;
 in vec4 color;
 in vec4 cloud_origin;
 in vec4 cloud_corner;
 in ivec4 cloud_numbers;
+in float cloud_alone;
 #else
 uniform usampler2D vertices;
 uniform sampler2D colors;
-uniform isampler2D clouds;  // of each cloud these three, and where in the other two its first sample is
+uniform isampler2D clouds;  // of each cloud these four, and where in the other two its first sample is
 uniform int samples;        // vertices of a cloud
 uniform int wide;           // samples in a row of texels
 vec4 vertex, color, cloud_origin, cloud_corner;
 ivec4 cloud_numbers;
+float cloud_alone;
 #endif
 
 uniform mat3 rotation;     // model space to camera space: right, up, depth
@@ -36,8 +39,9 @@ uniform float round_factor;
 uniform float steepest;
 uniform float reach;
 uniform float closing;     // side of a splat over the spacing to close, times the focal length
-uniform sampler2D places;  // of each level (axis, half); then of each node (links, spacings): see places.py
+uniform sampler2D places;  // of each level (axis, half); then of each node (links, spacings); spreads: see places.py
 uniform int levels;
+uniform int spreads;       // where these begin, texels
 uniform bool oriented;
 uniform vec3 albedo;
 uniform vec3 lamp;         // camera space
@@ -73,7 +77,7 @@ vec4 texel(int i) {
     return texelFetch(places, ivec2(i & 1023, i >> 10), 0);
 }
 
-// The same rule as kernels._facing.
+// The same rule as rules.facing.
 float facing(int row, int level, vec3 p) {
     float spacing = 0.0;
     while (row >= 0) {
@@ -89,10 +93,11 @@ float facing(int row, int level, vec3 p) {
     return abs(spacing);
 }
 
-// The same rule as kernels._spacing_at: the spacing to close at p, negative where starved.
-float spacing_at(int row, int level, vec3 p) {
+// The same rule as rules.spacing_at: the spacing to close at p, negative where starved.
+float spacing_at(int row, int level, float full, vec3 p) {
     float coarsest = 0.0;
     float spacing = 0.0;
+    int last = row;
     while (row >= 0) {
         vec2 halving = texel(level).xy;
         vec3 axis = vec3(equal(vec3(halving.x), vec3(0.0, 1.0, 2.0)));
@@ -101,6 +106,7 @@ float spacing_at(int row, int level, vec3 p) {
         int beyond = int(above ? node.x : node.y);
         float other = abs(above ? node.z : node.w);
         float apart = abs(dot(p, axis) - halving.y);
+        last = row;
         row = int(above ? node.y : node.x);
         spacing = above ? node.w : node.z;
         ++level;
@@ -113,6 +119,7 @@ float spacing_at(int row, int level, vec3 p) {
         }
         p -= above ? axis * halving.y : vec3(0.0);
     }
+    coarsest = full > 0.0 ? max(coarsest, full * texel(spreads + last / 4)[last % 4]) : coarsest;
     return spacing < 0.0 ? -max(-spacing, coarsest) : max(spacing, coarsest);
 }
 
@@ -187,7 +194,9 @@ bool fetch() {
         return false;
     cloud_origin = intBitsToFloat(told(4 * cloud));
     cloud_corner = intBitsToFloat(told(4 * cloud + 1));
-    ivec2 at = told(4 * cloud + 3).xy + ivec2(number % wide, number / wide);
+    ivec4 more = told(4 * cloud + 3);
+    cloud_alone = intBitsToFloat(more.z);
+    ivec2 at = more.xy + ivec2(number % wide, number / wide);
     vertex = vec4(texelFetch(vertices, at, 0));
     color = texelFetch(colors, at, 0);
     return true;
@@ -218,11 +227,13 @@ void main() {
     vec2 shade = lit ? (has_normal ? light(normal) : vec2(UNLIT, 0.0)) : vec2(1.0, 0.0);
     vec3 lit_color = min(color.rgb * albedo * shade.x + shade.y, 1.0);
     middle = 0.5 * size + center.xy * (focal / depth);
-    float across = cloud_corner.w;
+    float thin = floor(255.0 * color.a + 0.5);
+    float full = thin > 0.0 ? cloud_alone * exp2(thin / @STEPS@) : 0.0;
+    float across = max(cloud_corner.w, full * closing);
     bool starved = cloud_numbers.y >= STARVED;
     if (cloud_numbers.z >= 0) {
         vec3 inside = cloud_corner.xyz + cloud_origin.w * vertex.xyz;
-        float spacing = spacing_at(cloud_numbers.y & (STARVED - 1), cloud_numbers.z, inside);
+        float spacing = spacing_at(cloud_numbers.y & (STARVED - 1), cloud_numbers.z, full, inside);
         across = abs(spacing) * closing;
         starved = spacing < 0.0;
     }
