@@ -13,6 +13,7 @@ import math
 import time
 from typing import TYPE_CHECKING, Any
 
+import asked
 import numpy as np
 from support import models
 
@@ -30,6 +31,7 @@ STYLE = Style(two_sided=True, close_holes=False)
 
 
 def main() -> None:
+    asked.nothing(__doc__)
     model = models.sphere(21_500, cloud_size=12)
     cuts = [_cut(model, turn) for turn in range(ROUNDS)]
     nodes = int(np.median([len(cut.nodes) for cut, _ in cuts]))

@@ -65,7 +65,8 @@ class Region:
     bounds : tuple of 6 floats, optional
         x0, y0, z0, x1, y1, z1, model units, both ends included.
     spacing : float, optional
-        Detail that is enough, model units: a node is refined while its spacing is larger.
+        Detail that is enough, model units: a node is refined while a picture that ends at it is coarser, as refinement
+        for the screen has it (`lpc.density`).
     level : int, optional
         Deepest level, 0 for the root.
     """
@@ -96,7 +97,7 @@ class Region:
         """Which nodes are too coarse."""
         more = np.ones(len(nodes), dtype=bool)
         if self.spacing is not None:
-            more &= index.spacing[nodes] > self.spacing
+            more &= index.density.coarseness[nodes] > self.spacing
         if self.level is not None:
             more &= index.level[nodes] < self.level
         return more
@@ -160,24 +161,41 @@ class Reader:
         here = stops <= self.length
         return np.asarray(here & self.store.holds(starts, stops) if self.store.partial else here)
 
-    async def select(self, region: Region = EVERYTHING) -> NDArray[np.int64]:
+    async def select(self, region: Region = EVERYTHING, *, most_bytes: int | None = None) -> NDArray[np.int64]:
         """Find the nodes of a region, reading pages as needed; nodes that the file no longer has are left out.
+
+        Parameters
+        ----------
+        region : Region
+        most_bytes : int, optional
+            Look no deeper once the nodes of some levels have more bytes than that.
 
         Raises
         ------
         StoreError, FormatError
         """
-        index, found = self.index, []
+        index = self.index
+        while True:
+            loaded = int(index.page_loaded.sum())
+            nodes = await self._descend(region, most_bytes)
+            if region.spacing is None or int(index.page_loaded.sum()) == loaded:
+                break  # pages of uneven cells tell how coarse the nodes above them are
+        return nodes[self.reaches(index.offset[nodes], index.offset[nodes] + index.size[nodes])]
+
+    async def _descend(self, region: Region, most_bytes: int | None) -> NDArray[np.int64]:
+        """Go down the tree by what its pages say now; return nodes in order."""
+        index, found, size = self.index, [], 0
         frontier = np.zeros(1, dtype=np.int64)
-        while len(frontier):
+        while len(frontier) and (most_bytes is None or size <= most_bytes):
             await self.load_pages(frontier)
             frontier = frontier[index.known[frontier]]
             frontier = frontier[region.touches(index, frontier)]
             found.append(frontier)
-            children = index.children[frontier[region.deeper(index, frontier)]].ravel()
-            frontier = children[children >= 0].astype(np.int64)
-        nodes = np.sort(np.concatenate(found))
-        return nodes[self.reaches(index.offset[nodes], index.offset[nodes] + index.size[nodes])]
+            size += int(index.size[frontier].sum())
+            if region.spacing is not None:
+                await self.load_pages(_children(index, frontier))
+            frontier = _children(index, frontier[region.deeper(index, frontier)])
+        return np.sort(np.concatenate(found))
 
     async def present(self) -> NDArray[np.int64]:
         """Find all nodes that are there; those that only a damaged page leads to are not found.
@@ -318,3 +336,8 @@ class Reader:
             except Corrupt as error:
                 clouds.append(error)
         return clouds
+
+
+def _children(index: IndexTree, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+    children = index.children[nodes].ravel()
+    return children[children >= 0].astype(np.int64)

@@ -20,7 +20,7 @@ from .build import Build
 from .decoding import Decoder
 from .foresight import Foresight
 from .offers import Item, Request
-from .opening import Opening, add_page, naming, vouch_opening
+from .opening import Opening, add_page, hole_at, naming, vouch_opening
 from .recovery import Recovery
 from .scheduler import LinkState, Scheduler
 from .stats import ErrorLog, ErrorReport
@@ -192,7 +192,7 @@ class Traffic:
             nonlocal build
             if build is None and opening.look(assembly.data, ended=ended):
                 build = self._begin(opening, assembly.data)
-                assembly.used = opening.needed
+                assembly.used = opening.used
                 self._claim(build, request, assembly, np.flatnonzero(build.index.known))
                 if opened is not None:
                     opened.set_result(None)
@@ -207,8 +207,9 @@ class Traffic:
             request.range = ByteRange(0, await self.store.opening_bytes())
             data = await self.store.read(request.range, sink)
             look(ended=len(data) < request.range.size)
-            while build is None:  # the header is larger than the probe
-                await self.store.read(ByteRange(len(assembly.data), opening.needed), sink)
+            while build is None:  # the header is larger than the probe, or the first page is not here
+                if not hole_at(self.store, len(assembly.data)):
+                    await self.store.read(ByteRange(len(assembly.data), opening.needed), sink)
                 look(ended=len(assembly.data) < opening.needed)
             build.tail = assembly.rest()
             self._recovery.answered()
@@ -226,7 +227,7 @@ class Traffic:
         """Take what was just opened for the model, in one step, if it is another build than the one at hand."""
         assert opening.index is not None
         header = opening.index.header
-        self.payload += opening.needed
+        self.payload += opening.used
         self._stale = False
         if self.build is not None and self.build.index.header.digest == header.digest:
             self.store.forget(distrust_tags=True)  # the tag changed and the model did not

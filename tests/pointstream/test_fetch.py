@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,14 +18,15 @@ from support.servers import REPOSITORY, serve_in_thread
 
 import pointstream
 from lpc.errors import LpcError, StoreError, Unavailable
-from lpc.header import parse_header
+from lpc.header import HEADER_PROBE, parse_header
+from lpc.page import page_bytes
 from pointlink import virtual
 from pointlink.faults import Flip, Reset
 from pointlink.profiles import ADSL
 from pointstream import command
 from pointstream.fetch import FetchOptions, FetchReport, copy_name, fetch
 from pointstream.reading import Region
-from pointstream.stores.sparse import map_path
+from pointstream.stores.sparse import SparseFile, map_path
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -87,6 +89,48 @@ def test_a_budget_keeps_the_coarsest(model: bytes, tmp_path: Path) -> None:
     with pointstream.open(str(tmp_path / "whole.lpc")) as whole, pointstream.open(str(tmp_path / "coarse.lpc")) as part:
         assert (part.read(spacing=spacing).xyz == whole.read(spacing=spacing).xyz).all()
         assert len(part.read()) < len(whole.read())
+
+
+@pytest.mark.parametrize("bounds", [None, (499_990.0, 3_999_990.0, 110.0, 500_000.0, 4_000_000.0, 121.0)])
+def test_a_copy_never_holds_more_than_was_asked_for(model: bytes, tmp_path: Path, bounds: Any) -> None:
+    """Whatever brought it: the first request brings clouds too, and ones outside the bounds."""
+    header, out = parse_header(model), tmp_path / "part.lpc"
+    whole = copy(origin_of(model), tmp_path / "all.lpc", region=Region(bounds=bounds)).bytes
+    least = header.page0 + page_bytes(header, 0)
+    for most in (least, 12_000, 40_000, 70_000, 90_000, 120_000):  # each goes on with the copy of the one before
+        report = copy(origin_of(model), out, most_bytes=most, region=Region(bounds=bounds))
+        assert min(most - 7_000, whole) <= report.bytes <= most
+        with closing(SparseFile(out, length=len(model), tag=header.tag, writable=False)) as file:
+            assert file.present.total == report.bytes
+        with pointstream.open(str(out)) as part:
+            assert part.info["here"]["clouds"] == report.clouds
+    assert copy(origin_of(model), out, most_bytes=12_000).bytes == report.bytes, "what is there stays"
+    with pytest.raises(StoreError, match=f"header and first page alone take {least:,}"):
+        copy(origin_of(model), tmp_path / "none.lpc", most_bytes=least - 1)
+
+
+def test_a_budget_reads_no_more_of_the_index_than_it_can_use(model: bytes, tmp_path: Path) -> None:
+    origin = origin_of(model)
+    copy(origin, tmp_path / "part.lpc", most_bytes=10_000)
+    assert asked(origin) <= HEADER_PROBE
+
+
+@pytest.mark.parametrize("share", [0.01, 0.02, 0.4, 0.9])
+def test_of_a_file_that_is_cut_short_all_is_copied_and_it_is_said(
+    share: float, model: bytes, tmp_path: Path, capsys: Any
+) -> None:
+    cut_short = tmp_path / "model.lpc"
+    cut_short.write_bytes(model[: int(share * len(model))])
+    assert command.run(["fetch", str(cut_short), str(tmp_path / "copy"), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["cut_short"], report["complete"]) == (True, False)
+    with pointstream.open(str(cut_short)) as here, pointstream.open(str(tmp_path / "copy" / "model.lpc")) as there:
+        assert here.info == there.info
+        assert report["clouds"] == here.info["here"]["clouds"]
+    assert command.run(["fetch", str(cut_short), str(tmp_path / "copy")]) == 0
+    assert (
+        f"{report['clouds']} of {report['clouds_total']} clouds of a file that is cut short" in capsys.readouterr().out
+    )
 
 
 def test_an_interruption_costs_only_what_was_on_its_way(large_model: bytes, tmp_path: Path) -> None:
@@ -239,3 +283,14 @@ def test_render_and_export_work_from_the_cache_with_the_host_gone(model: bytes, 
     with np.load(tmp_path / "a.npz") as one, np.load(tmp_path / "b.npz") as other:
         assert (one["xyz"] == other["xyz"]).all()
     assert command.run(["export", "--cache", "none", address, str(tmp_path / "c.npz")]) == 1
+
+
+def test_a_copy_that_has_no_page_yet_is_a_model_without_samples(model: bytes, tmp_path: Path, capsys: Any) -> None:
+    (tmp_path / "model.lpc").write_bytes(model[: parse_header(model).page0 + 100])
+    assert command.run(["fetch", str(tmp_path / "model.lpc"), str(tmp_path / "copy")]) == 0
+    out = str(tmp_path / "copy" / "model.lpc")
+    capsys.readouterr()
+    assert command.run(["info", out, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["here"] == {"samples": 0, "clouds": 0}
+    assert command.run(["render", out, str(tmp_path / "a.png"), "--size", "32x32", "--backend", "cpu"]) == 0
+    assert command.run(["export", out, str(tmp_path / "a.ply")]) == 0

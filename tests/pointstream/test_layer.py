@@ -42,6 +42,16 @@ def test_everything_wanted_comes_and_is_right(kind: str, model: bytes, tmp_path:
     with_store(kind, model, tmp_path, check)
 
 
+@pytest.mark.parametrize("share", [0.006, 0.01, 0.1, 0.5])
+def test_of_a_file_that_is_cut_short_no_more_is_used_than_came(share: float, model: bytes, tmp_path: Path) -> None:
+    async def check(store: Store) -> None:
+        async with opened(store) as layer:
+            await fill(layer)
+            assert parse_header(model).page0 <= layer.stats.payload_bytes <= layer.stats.bytes_received
+
+    with_store("file", model[: int(share * len(model))], tmp_path, check)
+
+
 def test_opening_and_the_first_picture_take_one_request_of_64_kib(model: bytes) -> None:
     async def check(layer: AccessLayer, origin: Origin) -> None:
         assert layer.header == parse_header(model)
