@@ -46,9 +46,10 @@ BENT = 0.5
 planes, up to which they are on one surface. Leaves and strays are not, and being alone they are no larger."""
 LIKE = 0.5
 AGREED = 2.0
-"""Most spacing of a sample over the second largest of those of its four neighbours."""
+"""Most spacing of a sample over the second largest of those of its four neighbours, which is to be a thin one too."""
 TINY = 1e-9
 """Spacing of a sample of no surface."""
+
 
 def thin(position: NDArray[np.uint16], normal: NDArray[np.uint16]) -> NDArray[np.uint8]:
     """Spacing of the cloud's samples around each of them, where it is thin.
@@ -96,8 +97,9 @@ def thin(position: NDArray[np.uint16], normal: NDArray[np.uint16]) -> NDArray[np
     # What is thin is so around its neighbours too, or it is a stray.
     spacing = np.full(len(position) + 1, usual)
     spacing[pending], spacing[-1] = apart, 0.0
-    apart = np.minimum(apart, AGREED * np.partition(spacing[around], 2, axis=1)[:, 2])
-    found = apart > THIN * usual
+    agreed = np.partition(spacing[around], 2, axis=1)[:, 2]
+    apart = np.minimum(apart, AGREED * agreed)
+    found = (apart > THIN * usual) & (agreed > THIN * usual)
     codes[pending[found]] = np.clip(np.rint(STEPS * np.log2(apart[found])), 1, 255)
     return codes
 
@@ -162,10 +164,11 @@ def _apart(
     like: float,
     last: bool,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:  # pragma: no cover - compiled
-    """Spacing around the pending samples and their neighbours, -1 for none; 0 where a quarter of their plane holds no sample within a cell's side.
+    """Spacing around the pending samples, and their neighbours, -1 for none.
 
-    Quarters that leave the box do not count: what is there is in other clouds. With `last`, no empty ones do. Tiny where
-    the nearest samples make no surface.
+    The spacing is 0 where a quarter of their plane holds no sample within a cell's side, and tiny where the nearest
+    samples make no surface. Quarters that leave the box do not count: what is there is in other clouds. With `last`, no
+    empty ones do.
     """
     _, ny, nz = shape
     start = np.zeros(shape[0] * ny * nz + 1, np.int32)
@@ -261,4 +264,4 @@ def _unit(code: int) -> tuple[float, float, float]:  # pragma: no cover - compil
     """Return the normal of a code."""
     a, b, c = direction(np.int32(code))
     size = 1.0 / math.sqrt(a * a + b * b + c * c)
-    return a * size, b * size, c * size
+    return float(a * size), float(b * size), float(c * size)
