@@ -25,7 +25,7 @@ from .backend import Frame, Style, Take
 from .blending import LEAST
 from .gl_memory import COMMANDS_FROM, PLACEMENT, Buffers, Memory, Textures
 from .pack import SAMPLE_BYTES, Packer
-from .seen import alone
+from .seen import look_ups
 from .tables import STEPS
 
 if TYPE_CHECKING:
@@ -232,11 +232,11 @@ class GlBackend:
         placement["side"] = cut.spacing[part] * (splats.CLOSING * camera.focal)
         placement["node"], placement["count"] = nodes, self._arena.count[slots]
         placement["row"] = np.arange(part.start, part.start + len(nodes)) + cut.starved[part] * STARVED
-        placement["level"], placement["alone"] = -1, 0.0
+        placement["level"] = look_ups(cut, part, self._arena.thin[slots])
         if cut.places is not None:
-            placement["level"] = cut.places.level[part]
             placement["corner"] = self._arena.origin[slots] - cut.places.corner[part]
-            placement["alone"] = alone(cut.places, self._arena.scale[slots], part)
+            alone = self._arena.scale[slots] * cut.places.alone[part]
+            placement["side"] = np.where(placement["level"] < 0, placement["side"], alone)
         self._memory.draw(samples.points, slots, placement)
 
     def _close_holes(self, layers: _Layers, camera: Camera) -> _Layers:

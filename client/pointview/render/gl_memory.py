@@ -37,8 +37,7 @@ PLACEMENT = np.dtype(
         ("level", "<i4"),
         ("count", "<i4"),
         ("at", "<i4", 2),
-        ("alone", "<f4"),
-        ("padding", "<i4"),
+        ("padding", "<i4", 2),
     ]
 )
 """What a draw is told of one cloud; see the vertex shader."""
@@ -95,7 +94,7 @@ class Buffers:
 
     def points(self, program: Any) -> Any:
         """Return a vertex array."""
-        placement = "4f 4f 4i 8x 1f 4x /i", "cloud_origin", "cloud_corner", "cloud_numbers", "cloud_alone"
+        placement = "4f 4f 4i 16x /i", "cloud_origin", "cloud_corner", "cloud_numbers"
         content = [(self._vertex, "4u2", "vertex"), (self._color, "4f1", "color"), (self._placements, *placement)]
         return self._context.vertex_array(program, content)
 

@@ -53,7 +53,7 @@ def planes(position: NDArray[np.uint16]) -> NDArray[np.uint16]:
     codes = np.zeros(len(position), dtype=np.uint16)
     if len(position) < FEWEST:
         return codes
-    low, extent = box(position)
+    low, extent = _box(position)
     # The cloud as the largest face of its box.
     area = max(extent[0] * extent[1], extent[1] * extent[2], extent[2] * extent[0])
     side = CELL * math.sqrt(area / len(position))
@@ -69,7 +69,7 @@ def planes(position: NDArray[np.uint16]) -> NDArray[np.uint16]:
     return codes
 
 
-def box(position: NDArray[np.uint16]) -> tuple[NDArray[np.float64], list[float]]:
+def _box(position: NDArray[np.uint16]) -> tuple[NDArray[np.float64], list[float]]:
     """Lowest corner and sides of a box that holds all samples, but for a few that are far off the others."""
     few = len(position) // 100
     ordered = np.partition(position, (0, few, -1 - few, -1), axis=0).astype(np.float64)

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pointview.camera import Camera
-    from pointview.places import Places
     from pointview.refine import Cut
 
 
@@ -30,19 +29,19 @@ def place_table(cut: Cut) -> tuple[NDArray[Any], NDArray[Any]]:
     return places, halvings
 
 
-def alone(places: Places, scale: NDArray[np.float64], part: slice) -> NDArray[np.float64]:
-    """Model units to a step of clouds of samples that show what all of the model's would: see `tables.CLOUD`.
+def look_ups(cut: Cut, part: slice, thin: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Levels of the nodes whose samples look up how large they are, each its own size; -1 for nodes of one spacing.
 
     Parameters
     ----------
-    scale : (n,) float64
-        Model units to a step of the clouds.
     part : slice
-        Which of the drawn nodes they are.
+        Which nodes of the cut.
+    thin : (n,) bool
+        Whether some of their samples are in thin parts of the cloud.
     """
-    spread = places.spread[: len(places.level)][part]
-    uniform = np.where(places.level[part] < 0, spread, 1.0)  # there the kernels look up no place
-    return scale * places.alone[part] * uniform
+    if cut.places is None:
+        return np.full(len(thin), -1, dtype=np.int32)
+    return np.where(cut.places.uniform[part] & ~thin, np.int32(-1), cut.places.level[part])
 
 
 def pixels_by_cell(depth: NDArray[np.float32], cut: Cut, camera: Camera, *, stride: int = 1) -> NDArray[np.int64]:

@@ -340,12 +340,6 @@ def splat(
                         full = spacing_in(cloud, colors[first + i] >> np.uint32(24)) if cloud.thin else F(0.0)
                         spacing, _ = spacing_at(cloud, x, y, z, view.reach, full, places, halvings)
                         sides[i] = min(spacing * view.closing * (F(1.0) / depths[i]), view.largest)
-            elif cloud.thin:
-                for i in range(count):
-                    code = colors[first + i] >> np.uint32(24)
-                    if code > 0 and sides[i] >= F(0.0):
-                        spacing = max(cloud.spacing, spacing_in(cloud, code))
-                        sides[i] = min(spacing * view.closing * (F(1.0) / depths[i]), view.largest)
             _box(left, top, columns, rows, px[:count], py, sides, view)
             _fill(keys, int(width), int(place), depths, left, top, columns[:count], rows[:count])
             widest = F(0.0)

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 import numba
 import numpy as np
 
-from .planes import box
 from .rules import direction
 from .tables import STEPS
 
@@ -29,9 +28,11 @@ FEWEST = 24
 CELL = 1.6
 """Side of a cell, spacings of the cloud's own samples."""
 COMPANY = 9
-"""Samples in the 27 cells around a sample, itself among them, from which it is not alone; an even cloud has 23."""
-USUAL = 16
-"""Least median of that: where a surface folds within its box, samples are further apart than its faces say."""
+"""Samples in the 27 cells around a sample, itself among them, from which it is not alone."""
+USUAL = 23
+"""Median of that which cells are made for: as the largest face of the cloud's box has it, if the surface is even and
+does not fold. Else cells are tried again."""
+TRIES = 4
 WIDER = 2.0
 """Side of the cells of the next grid over that of the last."""
 GRIDS = 6
@@ -68,17 +69,18 @@ def thin(position: NDArray[np.uint16], normal: NDArray[np.uint16]) -> NDArray[np
     codes = np.zeros(len(position), dtype=np.uint8)
     if len(position) < FEWEST:
         return codes
-    low, extent = box(position)
+    low = position.min(axis=0).astype(np.float64)
+    extent = (position.max(axis=0) - low + 1.0).tolist()
     area = max(extent[0] * extent[1], extent[1] * extent[2], extent[2] * extent[0])
     side = CELL * math.sqrt(area / len(position))
-    for _ in range(GRIDS):
+    for _ in range(TRIES):
         side = max(side, max(extent) / LARGEST_GRID)
         company = _company(position, low, 1.0 / side, _shape(extent, side))
         median = float(np.median(company))
-        if median >= USUAL:
+        if USUAL / 1.5 <= median <= USUAL * 1.5:
             break
-        side *= math.sqrt(2.0)
-    usual = 3.0 * side / math.sqrt(max(median, 1.0))
+        side *= math.sqrt(USUAL / median)
+    usual = 3.0 * side / math.sqrt(median)
     pending = np.flatnonzero((company > 0) & (company < COMPANY) & (normal != 0))
     if not len(pending):
         return codes

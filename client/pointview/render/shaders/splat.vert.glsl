@@ -7,25 +7,23 @@
 // vertex: x, y, z in steps; two octahedral bytes
 // color: 0 to 1; the last of them says how far apart samples are in a thin part of the cloud (thin.py)
 // cloud_origin: offset of the cloud's (0, 0, 0) from the eye, axes of model space; model units of a step
-// cloud_corner: offset of the same from the corner of the node's cell; side of a splat, pixels times depth
+// cloud_corner: offset of the same from the corner of the node's cell; side of a splat, pixels times depth,
+//     or where the level says to look it up, model units of a step times what places.py says of the node's own samples
 // cloud_numbers: node; its row among the places, + STARVED; its level, or -1: one spacing everywhere; samples
-// cloud_alone: model units of a step, times what places.py says of the node's own samples
 #ifdef COMMANDS
 in vec4 vertex;
 in vec4 color;
 in vec4 cloud_origin;
 in vec4 cloud_corner;
 in ivec4 cloud_numbers;
-in float cloud_alone;
 #else
 uniform usampler2D vertices;
 uniform sampler2D colors;
-uniform isampler2D clouds;  // of each cloud these four, and where in the other two its first sample is
+uniform isampler2D clouds;  // of each cloud these three, and where in the other two its first sample is
 uniform int samples;        // vertices of a cloud
 uniform int wide;           // samples in a row of texels
 vec4 vertex, color, cloud_origin, cloud_corner;
 ivec4 cloud_numbers;
-float cloud_alone;
 #endif
 
 uniform mat3 rotation;     // model space to camera space: right, up, depth
@@ -194,9 +192,7 @@ bool fetch() {
         return false;
     cloud_origin = intBitsToFloat(told(4 * cloud));
     cloud_corner = intBitsToFloat(told(4 * cloud + 1));
-    ivec4 more = told(4 * cloud + 3);
-    cloud_alone = intBitsToFloat(more.z);
-    ivec2 at = more.xy + ivec2(number % wide, number / wide);
+    ivec2 at = told(4 * cloud + 3).xy + ivec2(number % wide, number / wide);
     vertex = vec4(texelFetch(vertices, at, 0));
     color = texelFetch(colors, at, 0);
     return true;
@@ -227,11 +223,11 @@ void main() {
     vec2 shade = lit ? (has_normal ? light(normal) : vec2(UNLIT, 0.0)) : vec2(1.0, 0.0);
     vec3 lit_color = min(color.rgb * albedo * shade.x + shade.y, 1.0);
     middle = 0.5 * size + center.xy * (focal / depth);
-    float thin = floor(255.0 * color.a + 0.5);
-    float full = thin > 0.0 ? cloud_alone * exp2(thin / @STEPS@) : 0.0;
-    float across = max(cloud_corner.w, full * closing);
+    float across = cloud_corner.w;
     bool starved = cloud_numbers.y >= STARVED;
     if (cloud_numbers.z >= 0) {
+        float thin = floor(255.0 * color.a + 0.5);
+        float full = thin > 0.0 ? cloud_corner.w * exp2(thin / @STEPS@) : 0.0;
         vec3 inside = cloud_corner.xyz + cloud_origin.w * vertex.xyz;
         float spacing = spacing_at(cloud_numbers.y & (STARVED - 1), cloud_numbers.z, full, inside);
         across = abs(spacing) * closing;
