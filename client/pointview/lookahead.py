@@ -3,7 +3,7 @@
 How far ahead it pays to look depends on who steers. So predictions are remembered until their time comes, and compared
 with where the camera is then: one *holds* if it is nearer to that than the camera that made it was. A horizon counts as
 long as most of its last predictions held: motion that turns round every second leaves the short ones. Predictions that
-come due while the camera rests, or after a jump, tell nothing of the motions in between.
+a rest or a jump puts an end to tell nothing of the motion.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ class LookaheadOptions:
         Nodes after which no later view is looked at: more than a link without anything else to do asks for in a frame.
     every : float
         Seconds from one prediction that is remembered to the next.
+    rest : float
+        Seconds without motion after which what was predicted before is forgotten.
     trust : float
         Share of a horizon's predictions that must have held; what is assumed before the first comes due.
     memory : int
@@ -45,6 +47,7 @@ class LookaheadOptions:
     horizons: tuple[float, ...] = (0.25, 0.5, 1.0, 2.0)
     enough: int = 64
     every: float = 0.1
+    rest: float = 0.25
     trust: float = 0.7
     memory: int = 16
 
@@ -58,6 +61,7 @@ class Lookahead:
     _held: list[float] = field(init=False)
     _due: list[deque[tuple[float, Camera, Camera]]] = field(init=False)
     _noted: float = field(default=-math.inf, init=False)
+    _moved: float = field(default=-math.inf, init=False)
     _camera: Camera | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
@@ -66,9 +70,12 @@ class Lookahead:
 
     def note(self, t: float, camera: Camera) -> None:
         """Take in where the camera of a frame is, at a time in seconds."""
-        if not self.motion.note(t, camera):
-            self._due = [deque() for _ in self.options.horizons]
-        self._judge(t, camera)
+        went_on = self.motion.note(t, camera)
+        if camera != self._camera:
+            if not went_on or t - self._moved > self.options.rest:
+                self._due = [deque() for _ in self.options.horizons]
+            self._camera, self._moved = camera, t
+            self._judge(t, camera)
         if t - self._noted >= self.options.every:
             self._noted = t
             for seconds, due in zip(self.options.horizons, self._due, strict=True):
@@ -77,13 +84,11 @@ class Lookahead:
 
     def _judge(self, t: float, camera: Camera) -> None:
         """Compare what was predicted for now with what is."""
-        moved, self._camera = camera != self._camera, camera
         for number, due in enumerate(self._due):
             while due and due[0][0] <= t:
                 _, here, there = due.popleft()
-                if moved:
-                    held = _apart(there, camera) < _apart(here, camera)
-                    self._held[number] += (held - self._held[number]) / self.options.memory
+                held = _apart(there, camera) < _apart(here, camera)
+                self._held[number] += (held - self._held[number]) / self.options.memory
 
     def nodes(self, look: Callable[[Camera], Cut]) -> Nodes:
         """Return the nodes that coming views lack, each once, most urgent first; none for a camera at rest.
