@@ -64,7 +64,9 @@ MAX_FRAME_WINDOW = 1 << 27
 class _Codec(Protocol):
     """What `codec_numpy` and `codec_compiled` both are."""
 
-    def arrange(self, lattice: NDArray[np.int64], rows: NDArray[np.uint32], begin: int, end: int) -> Placed: ...
+    def arrange(
+        self, lattice: NDArray[np.int64], rows: NDArray[np.uint32], begin: int, end: int, *, flipping: bool = True
+    ) -> Placed: ...
 
     def pack(
         self,
@@ -255,12 +257,13 @@ class _Writer:
         self._lattice, self._rows = lattice, to_channels(codes, schema, len(lattice))
         self._channels, self._codec = channels_of(schema), _codec(engine)
         self._window, self._compressor = WINDOWS[effort], _contexts.compressor(effort)
+        self._flipping = effort != "fast"
         # Faster strategies reuse another stream's Huffman codes in blocks up to 1 KiB, which takes up to 20 % more.
         self._small = _contexts.compressor("default" if effort == "fast" else effort)
 
     def place(self, begin: int, end: int) -> Placed:
         """Put the samples of a cloud in order."""
-        placed = self._codec.arrange(self._lattice, self._rows, begin, end)
+        placed = self._codec.arrange(self._lattice, self._rows, begin, end, flipping=self._flipping)
         if placed.nbits > TOP_BITS or placed.shift > MAX_SHIFT:
             raise ValueError(f"a cloud spans 2**{placed.nbits + placed.shift} steps, 2**48 are the most")
         return placed

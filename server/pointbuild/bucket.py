@@ -188,15 +188,14 @@ def sort_by_path(rows: NDArray[Any], cells: Cells, bucket: Bucket) -> tuple[NDAr
     Rows of equal paths come in any order.
     """
     window = cells.window(bucket.depth, 64 - INDEX_BITS)
-    packed = cells.keys(positions(rows), window)
+    xyz = positions(rows)
+    packed = cells.keys(xyz, window)
     _pack(packed)
     packed.sort()
     order = np.empty(len(rows), np.int32)
-    tied = _unpack(packed, order)
-    if tied and window.bits == 64 - INDEX_BITS:
+    if _unpack(packed, xyz, order):
         # 42 bits did not tell some apart: the rest of the path does. Rare, so a general sort will do.
-        rest = cells.fixed(positions(rows))
-        _sort_ties(packed, order, rest, cells.axes, cells.shifts, bucket.depth + window.bits)
+        _sort_ties(packed, order, cells.fixed(xyz), cells.axes, cells.shifts, bucket.depth + window.bits)
     out = np.empty_like(rows)
     np.take(as_words(rows), order, axis=0, out=as_words(out), mode="clip")  # "raise" would copy once more
     return out, packed
@@ -209,12 +208,14 @@ def _pack(keys: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _unpack(packed: Any, order: Any) -> Any:
-    """Fill `order`; whether neighbours share a key."""
+def _unpack(packed: Any, xyz: Any, order: Any) -> Any:
+    """Fill `order`; whether samples of different places share a key."""
     tied = False
     for i in range(len(packed)):
         order[i] = packed[i] & np.uint64(4194303)
-        tied |= i > 0 and packed[i] >> np.uint64(22) == packed[i - 1] >> np.uint64(22)
+        if i > 0 and packed[i] >> np.uint64(22) == packed[i - 1] >> np.uint64(22):
+            a, b = order[i], order[i - 1]
+            tied |= xyz[a, 0] != xyz[b, 0] or xyz[a, 1] != xyz[b, 1] or xyz[a, 2] != xyz[b, 2]
     return tied
 
 
