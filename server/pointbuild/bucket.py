@@ -12,8 +12,7 @@ from lpc.octahedral_compiled import unit_vectors
 
 from .areas import Probing, measure
 from .priority import defer_copies
-from .rows import as_words, positions
-from .spool import write_all
+from .rows import as_words, positions, priorities_of
 from .tree import Tree, grow
 
 if TYPE_CHECKING:
@@ -116,10 +115,11 @@ def partition(
     cells: Cells,
     probing: Probing,
     cloud_size: int,
+    seed: int,
     regions: Rows,
     normal_bits: int,
 ) -> BucketTree:
-    """Sort a bucket's rows by node, in place on disk; `Rows.settle` may be called once the result is safe.
+    """Sort a bucket's rows by node and put them back; `Rows.settle` may be called once the result is safe.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def partition(
         Which rows.
     above, shares : list of int
         Upper nodes from the root to the bucket, and how many samples each takes.
-    cells, probing, cloud_size
+    cells, probing, cloud_size, seed
         How to divide and measure.
     regions : Rows
         Where they are.
@@ -139,7 +139,7 @@ def partition(
     rows, scratch = sort_by_path(rows, cells, bucket)
     xyz = positions(rows)
     fixed = cells.fixed(xyz)
-    priority = np.ascontiguousarray(rows["priority"])
+    priority = priorities_of(rows, seed)
     defer_copies(fixed, priority)
     areas = measure(cells, probing, fixed, xyz, priority, bucket.depth)
     del xyz
@@ -156,8 +156,7 @@ def partition(
     out = np.empty_like(rows)
     np.take(as_words(rows), order, axis=0, out=as_words(out), mode="clip")  # "raise" would copy once more
     clouds = summarise(out, ends - counts, counts, normal_bits)
-    with regions.rewriting(first_row) as file:
-        write_all(file, out, 0)
+    regions.replace(first_row, out)
     clouds.first[:] += first_row
     used = np.flatnonzero(counts[: len(above)])
     measured = np.flatnonzero(areas.region & (areas.spacing > 0))
