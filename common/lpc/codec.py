@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import threading
-from collections.abc import Callable
 from functools import cache
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal, Protocol
@@ -18,7 +17,7 @@ import zstandard
 
 from .channels import Channels, channels_of, from_channels, to_channels
 from .cloud import Cloud
-from .context import ANCESTORS, Near, Part, Place, select
+from .context import Near, Part, Place, has_context, line_of, select
 from .errors import Corrupt
 from .lattice import dequantise
 from .octahedral import decode_normals
@@ -48,7 +47,6 @@ if TYPE_CHECKING:
 
 Effort = Literal["default", "best", "fast"]
 Engine = Literal["auto", "numpy", "compiled"]
-Known = Callable[[int, "Sequence[Cloud]"], bytes | None]
 
 
 WINDOWS: dict[Effort, int] = {"default": 64, "best": 64, "fast": 16}
@@ -155,8 +153,8 @@ def encode_cloud(
     context : sequence of Cloud
         The node's ancestors as they are decoded, from the root down; the last `ANCESTORS` of them count.
     effort : {"default", "best", "fast"}
-        "best" lets zstd search longer; "fast" looks at fewer previous samples and lets zstd search less
-            (docs/format.md, Choices of a writer).
+        "best" lets zstd search longer; "fast" takes no context, looks at fewer previous samples, tries fewer
+            orders and lets zstd search less (docs/format.md, Choices of a writer).
 
     Returns
     -------
@@ -168,8 +166,8 @@ def encode_cloud(
     ValueError
         If arguments are out of these ranges.
     """
-    writer = _Writer(lattice, codes, np.array([0, len(lattice)]), schema, effort, engine)
-    return writer.frame(writer.place(0, len(lattice)), context)
+    writer = CloudWriter(lattice, codes, np.array([0, len(lattice)]), schema, effort=effort, engine=engine)
+    return writer.frame(writer.place(0), context)
 
 
 def encode_clouds(
@@ -179,8 +177,6 @@ def encode_clouds(
     schema: Schema,
     *,
     parent: NDArray[np.int64] | None = None,
-    first: int = 0,
-    known: Known | None = None,
     effort: Effort = "default",
     engine: Engine = "auto",
 ) -> list[bytes]:
@@ -192,49 +188,28 @@ def encode_clouds(
     ----------
     parent : ndarray, (n,) int64, optional
         Number of each cloud's parent among these, always a smaller one; -1 for none.
-    first : int
-        Clouds before it are only there as context: their frames are left out.
-    known : callable, optional
-        ``known(i, context)`` gives the frame of cloud `i` if it is known without encoding, else None.
     """
-    writer = _Writer(lattice, codes, bounds, schema, effort, engine)
+    writer = CloudWriter(lattice, codes, bounds, schema, effort=effort, engine=engine)
     above = [-1] * (len(bounds) - 1) if parent is None else parent.tolist()
     inner = set(above)
     clouds: dict[int, Cloud] = {}
     frames = []
-    for number, (begin, end) in enumerate(itertools.pairwise(np.asarray(bounds).tolist())):
-        line: list[Cloud] = []
-        up = above[number]
-        while up >= 0 and len(line) < ANCESTORS and number >= first:
-            line.append(clouds[up])
-            up = above[up]
-        context = line[::-1]
-        frame = known(number, context) if known and number >= first else None
-        if frame is None or number in inner:
-            placed = writer.place(begin, end)
-            if number in inner:
-                clouds[number] = writer.known(placed)
-            if number >= first and frame is None:
-                frame = writer.frame(placed, context)
-        if frame is not None:
-            frames.append(frame)
+    for number in range(len(above)):
+        placed = writer.place(number)
+        frames.append(writer.frame(placed, [clouds[up] for up in line_of(number, above)]))
+        if number in inner:
+            clouds[number] = writer.cloud(placed)
     return frames
 
 
-def near_box(clouds: Sequence[Cloud], schema: Schema, low: NDArray[np.int64], high: NDArray[np.int64]) -> Near | None:
-    """Give the samples that ancestors have in a box of the lattice, faces included.
+class CloudWriter:
+    """Encodes clouds that stand one after another, in any order; for one thread.
 
-    They tell the context of a cloud of that box, but for one that keeps low bits apart: of so large boxes, None.
+    Parameters
+    ----------
+    lattice, codes, bounds, schema, effort, engine
+        As of `encode_clouds`.
     """
-    x, y, z = low.tolist()
-    if (high - low).max() >= 1 << TOP_BITS:
-        return None
-    box = np.stack([low - low, high - low]).astype(np.uint16)
-    return select(clouds, schema, corner=(x, y, z), shift=0, position=box, engine=_codec("auto"))
-
-
-class _Writer:
-    """What encodes the clouds of one batch."""
 
     def __init__(
         self,
@@ -242,11 +217,13 @@ class _Writer:
         codes: Mapping[str, NDArray[Any]],
         bounds: NDArray[np.int64],
         schema: Schema,
-        effort: Effort,
-        engine: Engine,
+        *,
+        effort: Effort = "default",
+        engine: Engine = "auto",
     ) -> None:
         lattice = np.ascontiguousarray(lattice, np.int64)
-        for begin, end in itertools.pairwise(np.asarray(bounds).tolist()):
+        self._bounds = np.asarray(bounds).tolist()
+        for begin, end in itertools.pairwise(self._bounds):
             if not 1 <= end - begin <= MAX_SAMPLES or not 0 <= begin < end <= len(lattice):
                 raise ValueError(
                     f"a cloud of samples {begin} to {end} of {len(lattice)}: 1 to {MAX_SAMPLES} are allowed"
@@ -257,18 +234,19 @@ class _Writer:
         self._lattice, self._rows = lattice, to_channels(codes, schema, len(lattice))
         self._channels, self._codec = channels_of(schema), _codec(engine)
         self._window, self._compressor = WINDOWS[effort], _contexts.compressor(effort)
-        self._flipping = effort != "fast"
+        self._guessing, self._flipping = has_context(schema, effort), effort != "fast"
         # Faster strategies reuse another stream's Huffman codes in blocks up to 1 KiB, which takes up to 20 % more.
         self._small = _contexts.compressor("default" if effort == "fast" else effort)
 
-    def place(self, begin: int, end: int) -> Placed:
+    def place(self, number: int) -> Placed:
         """Put the samples of a cloud in order."""
+        begin, end = self._bounds[number : number + 2]
         placed = self._codec.arrange(self._lattice, self._rows, begin, end, flipping=self._flipping)
         if placed.nbits > TOP_BITS or placed.shift > MAX_SHIFT:
             raise ValueError(f"a cloud spans 2**{placed.nbits + placed.shift} steps, 2**48 are the most")
         return placed
 
-    def known(self, placed: Placed) -> Cloud:
+    def cloud(self, placed: Placed) -> Cloud:
         """Give a cloud as context of others, as it will be decoded: with normals and colours only."""
         low = None
         if placed.shift:
@@ -277,9 +255,9 @@ class _Writer:
         return Cloud(origin=placed.corner, position=placed.position, shift=placed.shift, low=low, codes=codes)
 
     def frame(self, placed: Placed, context: Sequence[Cloud]) -> bytes:
-        """Write a cloud."""
+        """Encode a cloud; `context` as of `encode_cloud`."""
         near = None
-        if context and len(self._channels.guessed):
+        if context and self._guessing:
             x, y, z = placed.corner.tolist()
             near = select(
                 context,

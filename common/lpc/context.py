@@ -27,9 +27,17 @@ ANCESTORS = 4
 """Of those further up hardly any sample is near."""
 
 
-def has_context(schema: Schema) -> bool:
-    """Whether clouds are told from their ancestors: normals and colours are."""
-    return any(attribute.kind != "scalar" for attribute in schema)
+def has_context(schema: Schema, effort: str) -> bool:
+    """Whether our writer tells clouds from their ancestors: normals and colours, but where it has to be fast."""
+    return effort != "fast" and any(attribute.kind != "scalar" for attribute in schema)
+
+
+def line_of(number: int, parent: Sequence[int] | NDArray[Any]) -> list[int]:
+    """Nearest ancestors of a node, from the root down; a root's parent is -1."""
+    line = [number]
+    while len(line) <= ANCESTORS and parent[line[-1]] >= 0:
+        line.append(int(parent[line[-1]]))
+    return line[:0:-1]
 
 
 def with_ancestors(nodes: NDArray[np.int64], parent: NDArray[Any], generations: int) -> NDArray[np.int64]:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from .channels import Channels
 
-CODEC = 1
+CODEC = 2
 HEADER = struct.Struct("<BBBBBBB")
 MAX_SAMPLES = 1 << 20
 MAX_WINDOW = 64

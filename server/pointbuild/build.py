@@ -221,7 +221,7 @@ def _build(
         clouds = None if old is None or cluster else old.clouds(found, frame, options, GENERATOR)
         return publish(
             division, found, frame, inputs, options,
-            folder=folder, out=out, crew=crew, progress=progress, old=clouds,
+            folder=folder, out=out, crew=crew, progress=progress, ancestor_bytes=sizes.ancestors, old=clouds,
         )  # fmt: skip
 
 

@@ -15,23 +15,32 @@ import numpy as np
 from numba import njit
 
 from lpc.bounds import decode_centers, quantise_cones, quantise_spheres
-from lpc.codec import Effort, encode_clouds
-from lpc.context import ANCESTORS, with_ancestors
+from lpc.codec import CloudWriter, Effort
+from lpc.context import ANCESTORS, has_context, line_of, with_ancestors
 from lpc.octahedral import decode_normals, encode_normals
 from lpc.octahedral_compiled import unit_vectors
 from lpc.page import RECORD
 
+from .ancestry import Ancestor, Ancestry
 from .extend import OWNER
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from lpc.attributes import Schema
+    from lpc.cloud import Cloud
+    from lpc.payload import Placed
 
     from .assemble import Nodes
     from .extend import OldClouds
     from .frame import Frame
     from .rows import Rows
+
+
+RUN_SAMPLES = 1 << 16
+"""Encoded at a time by one thread, ancestors included."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,21 +105,31 @@ def encode_run(
     regions: Rows,
     schema: Schema,
     effort: Effort,
+    ancestry: Ancestry,
     old: OldClouds | None = None,
 ) -> Run:
     """Encode nodes `first` to `stop - 1`, but for those that are clouds of an older model."""
-    family = with_ancestors(np.arange(first, stop), nodes.parent, ANCESTORS)
-    before = len(family) - (stop - first)
+    generations = ANCESTORS if has_context(schema, effort) else 0
+    family = with_ancestors(np.arange(first, stop), nodes.parent, generations)
+    known = ancestry.find(family[family < first].tolist())
+    family = family[[node not in known for node in family.tolist()]]
     bounds = np.concatenate([[0], np.cumsum(nodes.samples[family])])
     lattice, owner, codes = _read(family, bounds, nodes, regions, schema)
-    place = np.searchsorted(family, nodes.parent[family])
-    parent = np.where(family[place] == nodes.parent[family], place, -1)
-    copies = None if old is None else old.copies(lattice, owner, bounds, before)
-    frames = encode_clouds(
-        lattice, codes, bounds, schema, parent=parent, first=before, effort=effort,
-        known=None if copies is None else copies.frame,
-    )  # fmt: skip
-    kept = 0 if copies is None else copies.count
+    writer = CloudWriter(lattice, codes, bounds, schema, effort=effort)
+    found = np.full(len(family), -1) if old is None else old.find(owner, bounds)
+    clouds = _Clouds(writer, dict(zip(family.tolist(), found.tolist(), strict=True)), known)
+    frames, made, kept = [], {}, 0
+    for node in range(first, stop):
+        line = line_of(node, nodes.parent) if generations else []
+        if old and old.stays(clouds.old(node), [clouds.old(above) for above in line]):
+            frames.append(old.frame(clouds.old(node)))
+            kept += 1
+            continue
+        frames.append(writer.frame(clouds.placed(node), [clouds.cloud(above) for above in line]))
+        if generations and nodes.subtree[node] > nodes.samples[node]:
+            made[node] = Ancestor(clouds.cloud(node), clouds.old(node))
+    ancestry.keep(int(nodes.depth[first]), made)
+    before = len(family) - (stop - first)
     own = int(bounds[before])
     lattice, bounds = lattice[own:], bounds[before:] - own
     shape = (stop - first, int(nodes.depth[first:stop].max()) + 1)
@@ -122,6 +141,41 @@ def encode_run(
             _spread(normals, bounds, first, nodes.parent, nodes.depth, geometry.axis, spread)
     sizes = np.array([len(frame) for frame in frames], np.uint32)
     return Run(first, frames, sizes, np.array([zlib.crc32(frame) for frame in frames], np.uint32), reach, spread, kept)
+
+
+class _Clouds:
+    """The clouds of a run, and those of their ancestors.
+
+    Parameters
+    ----------
+    writer : CloudWriter
+    found : dict of int to int
+        By node what the writer has, in its order: the cloud of an older model that it is, or -1.
+    known : mapping of int to Ancestor
+        All other ancestors.
+    """
+
+    def __init__(self, writer: CloudWriter, found: dict[int, int], known: Mapping[int, Ancestor]) -> None:
+        self._writer, self._found, self._known = writer, found, known
+        self._number = {node: number for number, node in enumerate(found)}
+        self._placed: dict[int, Placed] = {}
+        self._clouds = {node: ancestor.cloud for node, ancestor in known.items()}
+
+    def old(self, node: int) -> int:
+        """Cloud of the older model that has the samples of a node, and no others; -1: none."""
+        return self._found[node] if node in self._found else self._known[node].old
+
+    def placed(self, node: int) -> Placed:
+        """Put the samples of a node that the writer has in order, once."""
+        if node not in self._placed:
+            self._placed[node] = self._writer.place(self._number[node])
+        return self._placed[node]
+
+    def cloud(self, node: int) -> Cloud:
+        """Cloud of a node, as it will be decoded."""
+        if node not in self._clouds:
+            self._clouds[node] = self._writer.cloud(self.placed(node))
+        return self._clouds[node]
 
 
 def _read(

@@ -3,24 +3,24 @@
 A model is made of the lattice points and codes of its samples (`frame`), so what is decoded from it serves as well as
 what it was built of: the model of these samples and of others is, byte for byte, the one that all scans together give
 on the same lattice. Each of its samples brings the number of the cloud it was in. A cloud of the new model whose
-samples are all those of one old cloud, and no others, is that cloud, and its bytes are copied if what they are guessed
-from did not change either (`lpc.context`).
+samples are all those of one old cloud, and no others, is that cloud, and its bytes are copied if its nearest ancestors,
+from which they are guessed (`lpc.context`), did not change either.
 """
 
 from __future__ import annotations
 
 import os
 import zlib
+from collections import ChainMap
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lpc.codec import decode_cloud, near_box, samples_to_points
-from lpc.context import ANCESTORS, has_context, with_ancestors
+from lpc.codec import decode_cloud, samples_to_points
+from lpc.context import ANCESTORS, has_context, line_of
 from lpc.errors import BuildError, FormatError
 from lpc.header import HEADER_PROBE, PART_SUFFIX, parse_header
 from lpc.index import IndexTree
@@ -31,7 +31,7 @@ from .readers.scan import DEFAULT_ATTRIBUTES
 from .work import in_order
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -43,6 +43,8 @@ if TYPE_CHECKING:
     from .inputs import Inputs
     from .options import BuildOptions
     from .survey import Survey
+
+    Clouds = dict[int, Cloud]
 
 OWNER = "\0cloud"
 """Name of the column that says which cloud of the old model a sample was in, counted from 1; 0: it is new."""
@@ -130,55 +132,72 @@ class OldModel:
         )
 
     def batches(self, size: int) -> Iterator[PointBatch]:
-        """Yield all samples in the order of the clouds, with `OWNER`.
+        """Yield all samples, subtree by subtree, with `OWNER`.
 
         A decoded position may lie half a step outside the box of the input; it is given on the box, which is nearest to
         the same lattice point.
         """
-        size = max(size // (DECODERS + 2), 1)  # so many runs are here at a time
-        samples = np.cumsum(self.index.samples)
-        cuts = [0]
-        while cuts[-1] < len(samples):
-            reached = samples[cuts[-1] - 1] if cuts[-1] else 0
-            cuts.append(max(int(np.searchsorted(samples, reached + size, side="right")), cuts[-1] + 1))
+        size = max(size // (DECODERS + 2), 1)  # so many subtrees are here at a time
         # Decoding takes longer than everything else that reads a scan.
-        with ThreadPoolExecutor(DECODERS, thread_name_prefix="decode") as pool:
-            for _, batch in in_order(lambda run: pool.submit(self._decode, *run), pairwise(cuts), DECODERS):
+        with ThreadPoolExecutor(DECODERS, thread_name_prefix="decode") as pool, self.path.open("rb") as file:
+            parts = self._parts(size, file.fileno())
+            for _, batch in in_order(lambda part: pool.submit(self._batch, *part, file.fileno()), parts, DECODERS):
                 yield batch
 
-    def _decode(self, first: int, stop: int) -> PointBatch:
-        """Give the samples of nodes `first` to `stop - 1`."""
-        header = self.header
-        decoded = self.decoded(np.arange(first, stop))
-        clouds = [decoded[node] for node in range(first, stop)]
+    def _parts(self, size: int, file: int) -> Iterator[tuple[list[int], Clouds]]:
+        """Cut the tree into subtrees of at most `size` samples and single nodes above them.
+
+        Each comes with the clouds that it is told from; a node above comes decoded, since those below it need it.
+        """
+        todo: list[tuple[int, Clouds]] = [(0, {})]
+        while todo:
+            node, line = todo.pop()
+            if self.index.subtree[node] <= size:
+                yield self._below(node), line
+            else:
+                known = line | self._decoded([node], line, file)
+                yield [node], known
+                line = dict(list(known.items())[-ANCESTORS:])
+                todo += [(child, line) for child in self.index.children[node].tolist() if child >= 0]
+
+    def _below(self, node: int) -> list[int]:
+        """Give a node and its descendants, parents first."""
+        level, found = np.array([node]), []
+        while len(level):
+            found.append(level)
+            level = self.index.children[level].ravel()
+            level = level[level >= 0]
+        return np.concatenate(found).tolist()
+
+    def _batch(self, nodes: list[int], known: Clouds, file: int) -> PointBatch:
+        """Give the samples of some nodes; `known` are their ancestors that are not among them."""
+        header, decoded = self.header, self._decoded(nodes, known, file)
+        clouds = [decoded[node] for node in nodes]
         codes = {
             entry.name: np.concatenate([cloud.codes[entry.name] for cloud in clouds]) for entry in header.attributes
         }
         points = samples_to_points(np.concatenate([cloud.lattice() for cloud in clouds]), codes, header)
         xyz = np.clip(points.xyz, header.bounds[:3], header.bounds[3:])
-        owner = np.repeat(np.arange(first, stop, dtype=np.uint32) + np.uint32(1), self.index.samples[first:stop])
+        owner = np.repeat(np.array(nodes, np.uint32) + np.uint32(1), self.index.samples[nodes])
         return PointBatch(xyz, {**points.attributes, OWNER: owner})
 
-    def decoded(self, nodes: NDArray[np.int64]) -> dict[int, Cloud]:
-        """Decode clouds and all their ancestors: as many again, where nodes stand side by side in a level."""
-        schema, parent = self.header.attributes, self.index.parent
-        found: dict[int, Cloud] = {}
-        with self.path.open("rb") as file, _told(self.path):
-            wanted = with_ancestors(nodes, parent, len(parent)) if has_context(schema) else nodes
-            for node in wanted.tolist():
-                frame, samples = self.frame(file.fileno(), node), int(self.index.samples[node])
-                context = [found[above] for above in self.line(node)]
-                found[node] = decode_cloud(frame, samples=samples, schema=schema, context=context)
+    def _decoded(self, nodes: list[int], known: Clouds, file: int) -> Clouds:
+        """Decode nodes, parents first, but for those that are known."""
+        found = {node: known[node] for node in nodes if node in known}
+        schema, clouds = self.header.attributes, ChainMap(found, known)
+        with _told(self.path):
+            for node in nodes:
+                if node not in found:
+                    frame, samples = self.frame(file, node), int(self.index.samples[node])
+                    context = [clouds[above] for above in self.line(node)]
+                    found[node] = decode_cloud(frame, samples=samples, schema=schema, context=context)
         return found
 
     def line(self, node: int) -> list[int]:
         """Nodes that tell a cloud, from the root down."""
-        if not has_context(self.header.attributes):
-            return []
-        line = [node]
-        while len(line) <= ANCESTORS and (above := int(self.index.parent[line[-1]])) >= 0:
-            line.append(above)
-        return line[:0:-1]
+        header = self.header
+        told = has_context(header.attributes, header.extra[PACKING]["effort"])
+        return line_of(node, self.index.parent) if told else []
 
     def frame(self, file: int, node: int) -> bytes:
         """Bytes of a cloud, checked."""
@@ -290,80 +309,32 @@ class OldClouds:
 
     model: OldModel
 
-    def copies(
-        self, lattice: NDArray[np.int64], owner: NDArray[np.uint32], bounds: NDArray[np.int64], first: int
-    ) -> Copies:
-        """Find out which clouds may be copied.
+    def find(self, owner: NDArray[np.uint32], bounds: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Old cloud that has the samples of each cloud, and no others; -1: none.
 
         Parameters
         ----------
-        lattice : ndarray, (n, 3) int64
         owner : ndarray, (n,) uint32
             `OWNER` of all samples.
         bounds : ndarray, (k + 1,) int64
             Cloud i is the samples ``bounds[i]`` to ``bounds[i + 1]``.
-        first : int
-            Clouds before it are only context.
         """
-        model, starts = self.model, bounds[:-1]
+        starts = bounds[:-1]
         number = owner[starts].astype(np.int64) - 1
         one = np.minimum.reduceat(owner, starts) == np.maximum.reduceat(owner, starts)
-        found = np.where(one & (number >= 0) & (model.index.samples[number] == np.diff(bounds)), number, -1)
-        found[:first] = -1
-        low, high = np.minimum.reduceat(lattice, starts), np.maximum.reduceat(lattice, starts)
-        context: dict[int, Cloud] = {}
-        if has_context(model.header.attributes):
-            parents = np.unique(model.index.parent[found[found >= 0]]).astype(np.int64)
-            context = model.decoded(parents[parents >= 0])
-        return Copies(model, found, low, high, context)
+        return np.where(one & (number >= 0) & (self.model.index.samples[number] == np.diff(bounds)), number, -1)
 
+    def stays(self, number: int, line: list[int]) -> bool:
+        """Whether a cloud that is old cloud `number`, and whose ancestors are those of `line`, has the same bytes."""
+        return number >= 0 and self.model.line(number) == line
 
-@dataclass(slots=True)
-class Copies:
-    """Clouds of the old model for some of the new one.
-
-    Parameters
-    ----------
-    model : OldModel
-    found : ndarray, (k,) int64
-        Old cloud that has the samples of each, -1: none.
-    low, high : ndarray, (k, 3) int64
-        Boxes of the clouds.
-    context : dict of int to Cloud
-        Old clouds that tell those.
-    count : int
-        Frames given.
-    """
-
-    model: OldModel
-    found: NDArray[np.int64]
-    low: NDArray[np.int64]
-    high: NDArray[np.int64]
-    context: dict[int, Cloud]
-    count: int = 0
-
-    def frame(self, cloud: int, context: Sequence[Cloud]) -> bytes | None:
-        """Bytes of a cloud; None if it is another one, or if its ancestors tell it otherwise."""
-        node = int(self.found[cloud])
-        if node < 0 or not self._tell_the_same(cloud, context):
-            return None
-        self.count += 1
-        with self.model.path.open("rb") as file:
-            return self.model.frame(file.fileno(), node)
-
-    def _tell_the_same(self, cloud: int, context: Sequence[Cloud]) -> bool:
-        """Whether the ancestors have the same samples in the box of a cloud, in the same order."""
-        schema, low, high = self.model.header.attributes, self.low[cloud], self.high[cloud]
-        if not has_context(schema):
-            return True
-        new = near_box(context, schema, low, high)
-        old = near_box([self.context[node] for node in self.model.line(int(self.found[cloud]))], schema, low, high)
-        return (
-            new is not None
-            and old is not None
-            and np.array_equal(new.position, old.position)
-            and np.array_equal(new.rows, old.rows)
-        )
+    def frame(self, number: int) -> bytes:
+        """Bytes of an old cloud."""
+        file = os.open(self.model.path, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            return self.model.frame(file, number)
+        finally:
+            os.close(file)
 
 
 def read_header(path: Path) -> Header:

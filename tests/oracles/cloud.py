@@ -39,7 +39,7 @@ def read_cloud(
         The header's entries: `name`, `kind`, `bits`.
     """
     payload = zstandard.ZstdDecompressor().decompress(frame)
-    assert payload[0] == 1
+    assert payload[0] == 2
     axes, nbits, shift, window, turn, corner_bytes = payload[1:7]
     rotation, flips = axes % 4, axes // 4
     at = 7
