@@ -64,10 +64,10 @@ class Sketch:
         if not other.samples:
             return
         self.samples += other.samples
-        self.hashes, first = np.unique(np.concatenate([self.hashes, other.hashes]), return_index=True)
-        self.xyz = np.concatenate([self.xyz, other.xyz])[first]
-        few = max(int(np.searchsorted(self.hashes, _limit(self.samples), side="right")), 1)
-        self.hashes, self.xyz = self.hashes[:few], self.xyz[:few]
+        hashes, xyz = np.concatenate([self.hashes, other.hashes]), np.concatenate([self.xyz, other.xyz])
+        small = np.flatnonzero(hashes <= max(_limit(self.samples), hashes.min()))
+        self.hashes, first = np.unique(hashes[small], return_index=True)
+        self.xyz = xyz[small[first]]
 
     def arrays(self) -> list[NDArray[Any]]:
         """Everything, for a journal."""
