@@ -23,6 +23,7 @@ from lpc.page import RECORD
 
 from .ancestry import Ancestor, Ancestry
 from .extend import OWNER
+from .rows import copy_places
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -193,7 +194,7 @@ def _read(
             rows = np.empty(int(nodes.run_count[run]), regions.dtype)
             regions.read(int(nodes.run_first[run]), rows)
             to = slice(at, at + len(rows))
-            lattice[to] = rows["xyz"]
+            copy_places(rows["xyz"], lattice[to])
             if known:
                 owner[to] = rows[OWNER]
             for name in names:

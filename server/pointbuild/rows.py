@@ -10,6 +10,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+from numba import njit
 
 from .extend import OWNER
 from .priority import priorities
@@ -113,7 +114,9 @@ def whole_words(size: int) -> int:
 
 def positions(rows: NDArray[Any]) -> NDArray[np.float64]:
     """Lattice coordinates (n, 3) of rows."""
-    return rows["xyz"].astype(np.float64, order="C")
+    out = np.empty((len(rows), 3))
+    copy_places(rows["xyz"], out)
+    return out
 
 
 def fill_rows(
@@ -132,13 +135,25 @@ def fill_rows(
     schema : Schema
     """
     rows = np.zeros(len(places), dtype)
-    rows["xyz"] = places
+    copy_places(places, rows["xyz"])
     for attribute in schema:
         column = values[attribute.name]
         rows[attribute.name] = column if attribute.kind == "normal" else encode_values(attribute, column)
     if OWNER in values:
         rows[OWNER] = values[OWNER]
     return rows
+
+
+def copy_places(places: NDArray[Any], out: NDArray[Any]) -> None:
+    """Copy whole numbers (n, 3) into an array of another type: numpy takes three times as long over columns of rows."""
+    _copy(places, out)
+
+
+@njit(cache=True, nogil=True)
+def _copy(places: Any, out: Any) -> None:
+    for i in range(len(places)):
+        for axis in range(3):
+            out[i, axis] = places[i, axis]
 
 
 def priorities_of(rows: NDArray[Any], seed: int) -> NDArray[np.uint64]:
