@@ -9,12 +9,11 @@ run is the same. The frame loop stands for a viewer that wants everything, coars
 from __future__ import annotations
 
 import asyncio
-import sys
 import time
 from contextlib import asynccontextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+import asked
 import numpy as np
 from oracles.build import build_bytes
 
@@ -160,7 +159,8 @@ def made_up() -> bytes:
 
 
 def main() -> None:
-    data = Path(sys.argv[1]).read_bytes() if len(sys.argv) > 1 else made_up()
+    model = asked.model(__doc__)
+    data = made_up() if model is None else model.read_bytes()
     print(f"{len(data)} bytes, the first request has {HEADER_PROBE}")
     print("line                 time  payload   useful  goodput rtt[ms] first[s] requests")
     for name in ("adsl", "lan", "1.25M,300ms", "20M,50ms", "256k,100ms"):

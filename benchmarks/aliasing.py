@@ -9,7 +9,6 @@ shows as flicker. `--model MODEL.lpc` takes a scan instead; its reference is its
 
 from __future__ import annotations
 
-import argparse
 import math
 import tempfile
 import time
@@ -18,6 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import asked
 import numpy as np
 from PIL import Image
 from support import traced
@@ -28,7 +28,6 @@ from lpc.index import IndexTree
 from lpc.points import PointBatch
 from pointbuild import BuildOptions, build_model
 from pointbuild.arrays import ArrayScan
-from pointbuild.sizes import parse_size
 from pointview.camera import Camera
 from pointview.refine import refine
 from pointview.render import Style, antialias, shading
@@ -130,8 +129,8 @@ WAYS = (
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--samples", type=parse_size, default=1_500_000)
+    parser = asked.parser(__doc__)
+    parser.add_argument("--samples", type=asked.samples, default=1_500_000)
     parser.add_argument("--tolerances", type=float, nargs="+", default=[0.5, 1.0, 2.0, 4.0, 8.0])
     parser.add_argument("--model", type=Path, help="a model instead of the surfaces")
     parser.add_argument("--sheet", type=Path, help="write the pictures of the nearest view side by side")

@@ -14,6 +14,7 @@ import tempfile
 import time
 from pathlib import Path
 
+import asked
 import laspy
 import numpy as np
 
@@ -22,8 +23,8 @@ from pointbuild.extend import read_header
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--samples", type=lambda text: int(text.replace("M", "000000")), default=10_000_000)
+    parser = asked.parser(__doc__)
+    parser.add_argument("--samples", type=asked.samples, default=10_000_000)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()))
     parser.add_argument("--split", choices=["spread", "patch"], help=argparse.SUPPRESS)

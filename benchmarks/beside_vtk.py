@@ -17,28 +17,32 @@ are kept.
 
 from __future__ import annotations
 
-import argparse
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import asked
 import numpy as np
-import vtkmodules.vtkRenderingOpenGL2  # noqa: F401  (registers the classes that draw)
 from PIL import Image
 from splat import cut_of, front, sphere_clouds
 from support import models
-from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
-from vtkmodules.vtkCommonCore import vtkPoints, vtkUnsignedCharArray
-from vtkmodules.vtkCommonDataModel import vtkPolyData
-from vtkmodules.vtkFiltersGeneral import vtkVertexGlyphFilter
-from vtkmodules.vtkRenderingCore import vtkActor, vtkPolyDataMapper, vtkRenderer, vtkRenderWindow
 
 from lpc.codec import cloud_to_points
 from lpc.points import PointBatch
 from pointview.camera import Camera
 from pointview.render import Style, open_backend
+
+with suppress(ModuleNotFoundError):  # `--help` works without
+    import vtkmodules.vtkRenderingOpenGL2  # noqa: F401  (registers the classes that draw)
+    from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
+    from vtkmodules.vtkCommonCore import vtkPoints, vtkUnsignedCharArray
+    from vtkmodules.vtkCommonDataModel import vtkPolyData
+    from vtkmodules.vtkFiltersGeneral import vtkVertexGlyphFilter
+    from vtkmodules.vtkRenderingCore import vtkActor, vtkPolyDataMapper, vtkRenderer, vtkRenderWindow
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -144,10 +148,12 @@ def _bytes(color: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = asked.parser(__doc__)
     parser.add_argument("models", nargs="*", type=Path)
     parser.add_argument("--pictures", type=Path)
     options = parser.parse_args()
+    if find_spec("vtkmodules") is None:
+        parser.error("VTK is not installed: pip install vtk")
     print(f"{'model':16} {'px':>2} {'':10} {'ms wall':>8} {'CPU':>7} {'M/s wall':>8} {'CPU':>6}"
           f" {'wall':>6} {'CPU':>6} {'lean':>6} {'differ':>7}")  # fmt: skip
     for scene in scenes(options.models):

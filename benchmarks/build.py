@@ -17,6 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import asked
 import laspy
 import numpy as np
 import zstandard
@@ -31,8 +32,8 @@ CHUNK = 500_000
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--samples", type=lambda text: int(text.replace("M", "000000")), default=10_000_000)
+    parser = asked.parser(__doc__)
+    parser.add_argument("--samples", type=asked.samples, default=10_000_000)
     parser.add_argument("--memory", default="2G")
     parser.add_argument("--threads", type=int, default=0)
     parser.add_argument("--cloud-size", type=int, default=2048)

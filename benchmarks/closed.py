@@ -6,6 +6,7 @@ are pixels of the surface that show the background or the far side; growth is th
 
 from __future__ import annotations
 
+import asked
 import numpy as np
 from support import models, traced
 
@@ -16,6 +17,7 @@ from pointview.render.cpu import CpuBackend
 
 
 def main() -> None:
+    asked.nothing(__doc__)
     camera = Camera(eye=(1, -2.5, 2), target=(0, 0, 0), up=(0, 0, 1), width=400, height=400)
     print(f"{'model':8} {'splats':12} {'tolerance':>9} {'clouds':>7} {'starved':>7} {'px':>5} {'holes %':>8}  growth")
     for name, model, distance in (

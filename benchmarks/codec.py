@@ -6,11 +6,11 @@ with an error bound of r / 2 and 8 + 8 bits a normal. Sizes include the frame an
 
 from __future__ import annotations
 
-import argparse
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import asked
 import numpy as np
 import zstandard
 from plyfile import PlyData
@@ -193,7 +193,7 @@ def measure(path: Path, size: int, effort: str, repeats: int, with_color: bool) 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = asked.parser(__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("names", nargs="*", default=OBJECTS)
     parser.add_argument("--cloud-size", type=int, default=2048)

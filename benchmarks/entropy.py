@@ -7,11 +7,11 @@ for nothing, or that of all clouds of the scan, which one table in the header co
 
 from __future__ import annotations
 
-import argparse
 from collections import defaultdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import asked
 import numpy as np
 import zstandard
 from codec import COLOR, NORMAL, OBJECTS, clouds, load, model_spacing, stream_bits
@@ -87,7 +87,7 @@ def measure(path: Path, size: int, effort: str, with_color: bool) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = asked.parser(__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("names", nargs="*", default=OBJECTS)
     parser.add_argument("--cloud-size", type=int, default=2048)

@@ -10,9 +10,8 @@ their checks and became resident; the rest are gaps between them, clouds cut in 
 from __future__ import annotations
 
 import asyncio
-import sys
-from pathlib import Path
 
+import asked
 import numpy as np
 from access import FRAME, made_up
 
@@ -71,7 +70,8 @@ async def jump(data: bytes, every: float, capacity: int, seed: int) -> str:
 
 
 def main() -> None:
-    data = Path(sys.argv[1]).read_bytes() if len(sys.argv) > 1 else made_up()
+    model = asked.model(__doc__)
+    data = made_up() if model is None else model.read_bytes()
     print(f"{len(data)} bytes, {parse_header(data).samples} samples")
     print("every ms  memory MB  used  line  evicted  wants a frame")
     for every, capacity in ((0.1, 4_000_000), (0.1, 1_000_000), (1.0, 1_000_000)):

@@ -14,7 +14,7 @@ import contextlib
 import statistics
 import time
 
-import click
+import asked
 from rich.console import Console
 from rich.table import Table
 
@@ -112,14 +112,15 @@ async def measure(profile: Profile, seconds: float, table: Table, name: str) -> 
             )
 
 
-@click.command()
-@click.option("--seconds", default=10.0, show_default=True)
-@click.option("--profile", "profiles", multiple=True, default=["adsl"], show_default=True)
-def main(seconds: float, profiles: tuple[str, ...]) -> None:
+def main() -> None:
+    parser = asked.parser(__doc__)
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--profile", action="append", dest="profiles", help="adsl if not given; more may follow")
+    options = parser.parse_args()
     table = Table("link", "what", "asked", "measured", "error", "")
-    for name in profiles:
+    for name in options.profiles or ["adsl"]:
         with asyncio.Runner(loop_factory=precise_loop) as runner:
-            runner.run(measure(parse_profile(name), seconds, table, name))
+            runner.run(measure(parse_profile(name), options.seconds, table, name))
     Console().print(table)
 
 

@@ -6,7 +6,6 @@ the seed and the depth, and not on the number of threads. ``--rays`` counts how 
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import time
@@ -15,6 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import asked
 import numpy as np
 from mixing import BRICKS, SIZE, Interface
 
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = asked.parser(__doc__)
     parser.add_argument("out", type=Path, metavar="OUT.ply")
-    parser.add_argument("--samples", type=_count, default=2_000_000, help="about so many: 200k, 2M, 234717830")
+    parser.add_argument("--samples", type=asked.samples, default=2_000_000, help="about so many: 200k, 2M, 234717830")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--depth", type=float, default=55.0, help="mean crossings of rays from the worst viewpoint")
     parser.add_argument("--color", action="store_true", help="with colours")
@@ -110,14 +110,6 @@ def _ahead(function: Any, count: int, threads: int) -> Iterator[Any]:
                 yield flying.popleft().result()
         while flying:
             yield flying.popleft().result()
-
-
-def _count(text: str) -> int:
-    units = {"k": 1_000, "M": 1_000_000, "G": 1_000_000_000}
-    try:
-        return int(float(text[:-1]) * units[text[-1]]) if text[-1:] in units else int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of samples") from None
 
 
 if __name__ == "__main__":

@@ -8,10 +8,10 @@ spacings of the samples drawn there, of at least a pixel: the mean, the 99th per
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import asked
 import numpy as np
 from support import shells
 from support.moments import Run, watch
@@ -32,7 +32,7 @@ def runs(quick: bool) -> list[Run]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = asked.parser(__doc__)
     parser.add_argument("--quick", action="store_true", help="only the surfaces and their samplings")
     parser.add_argument("--every", type=float, default=0.1, help="seconds from one picture to the next")
     parser.add_argument("--only", default="", help="rows whose text holds this")

@@ -11,9 +11,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-import sys
 from typing import TYPE_CHECKING, Any
 
+import asked
 import numpy as np
 
 import pointstream
@@ -32,7 +32,9 @@ SECONDS = 60.0
 
 
 def main() -> None:
-    path = sys.argv[1]
+    parser = asked.parser(__doc__)
+    parser.add_argument("model", metavar="MODEL.lpc")
+    path = parser.parse_args().model
     views = [_view(path, turn) for turn in TURNS]
     print(f"{'from':>6} {'splats':>10} {'culled':>10} {'fewer':>6} {'pixels that differ':>19}")
     for turn, view in zip(TURNS, views, strict=True):

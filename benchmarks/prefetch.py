@@ -25,12 +25,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import asked
 import numpy as np
 
 import pointstream
@@ -61,7 +61,8 @@ PATHS = ("orbit", "flight", "stops", "turns", "jumps")
 
 
 def main() -> None:
-    tasks = [(model, path, prefetch) for model in sys.argv[1:] for path in PATHS for prefetch in (False, True)]
+    models = [str(model) for model in asked.models(__doc__)]
+    tasks = [(model, path, prefetch) for model in models for path in PATHS for prefetch in (False, True)]
     with ProcessPoolExecutor(2) as pool:
         rows = dict(zip(tasks, pool.map(_row, *zip(*tasks, strict=True)), strict=True))
     print(

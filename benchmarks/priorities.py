@@ -9,11 +9,11 @@ interpolated between the moments of the curve, and the mean error until the slow
 from __future__ import annotations
 
 import contextlib
-import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import asked
 import numpy as np
 
 from pointlink.profiles import parse_profile
@@ -30,13 +30,14 @@ PRIORITIES = ("index", "error")
 
 
 def main() -> None:
-    tasks = [(path, near, priority) for path in sys.argv[1:] for near in (False, True) for priority in PRIORITIES]
+    models = [str(model) for model in asked.models(__doc__)]
+    tasks = [(path, near, priority) for path in models for near in (False, True) for priority in PRIORITIES]
     with ProcessPoolExecutor(2) as pool:
         curves = dict(zip(tasks, pool.map(_curve, *zip(*tasks, strict=True)), strict=True))
     print(
         f"{'model':28} {'priority':9}" + "".join(f"{f'{share:.0%} s':>8}" for share in SHARES) + f"{'mean error':>12}"
     )
-    for path in sys.argv[1:]:
+    for path in models:
         for near in (False, True):
             both = [curves[path, near, priority] for priority in PRIORITIES]
             initial = max(curve[0][1] for curve in both)

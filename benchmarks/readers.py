@@ -1,16 +1,16 @@
 """CPU time a sample of every reader, on generated files of a million samples.
 
-Usage: PYTHONPATH=common:server:client python benchmarks/readers.py [SAMPLES]
+Usage: PYTHONPATH=common:server:client python benchmarks/readers.py [--samples 1M]
 """
 
 from __future__ import annotations
 
-import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
+import asked
 import laspy
 import numpy as np
 import pye57
@@ -93,7 +93,9 @@ def measure(path: Path) -> tuple[float, float, int]:
 
 
 def main() -> None:
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000
+    parser = asked.parser(__doc__)
+    parser.add_argument("--samples", type=asked.samples, default=1_000_000)
+    count = parser.parse_args().samples
     print(f"{'file':28}{'bytes/sample':>14}{'open ms':>10}{'ns/sample':>12}")
     with tempfile.TemporaryDirectory() as folder:
         for path in write_all(Path(folder), count):

@@ -9,6 +9,7 @@ import time
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+import asked
 import numpy as np
 
 from lpc.density import Density
@@ -92,6 +93,7 @@ def milliseconds(work: Callable[..., Any], *arguments: Any, **options: Any) -> f
 
 
 def main() -> None:
+    asked.nothing(__doc__)
     index = sphere_index()
     resident = np.ones(index.header.nodes, dtype=bool)
     some = np.random.default_rng(0).random(index.header.nodes) < 0.9

@@ -20,6 +20,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import asked
 import numpy as np
 from build import Stages
 from estimates import Costs, Prices, print_estimates
@@ -35,9 +36,9 @@ PAPER = {"samples": 234_717_830, "seconds": 13_357, "bytes": 925 << 20, "bits": 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--samples", type=int, default=PAPER["samples"])
-    parser.add_argument("--small", type=int, default=2_000_000, help="samples of the small sampling")
+    parser = asked.parser(__doc__)
+    parser.add_argument("--samples", type=asked.samples, default=PAPER["samples"])
+    parser.add_argument("--small", type=asked.samples, default=2_000_000, help="samples of the small sampling")
     parser.add_argument("--depth", type=float, default=55.0, help="of the surface; see make_mixing.py")
     parser.add_argument("--memory", default="2G")
     parser.add_argument("--folder", type=Path, default=Path(tempfile.gettempdir()))

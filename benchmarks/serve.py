@@ -13,7 +13,6 @@ Promised: at most 200 us per range of 64 KB, and at least 2.5 times the requests
 
 from __future__ import annotations
 
-import argparse
 import os
 import random
 import re
@@ -26,6 +25,8 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import asked
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -170,7 +171,7 @@ def print_table(size: int, runs: dict[str, list[Figures]]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = asked.parser(__doc__)
     parser.add_argument("--requests", type=int, default=2000, help="of each turn")
     parser.add_argument("--connections", type=int, default=8)
     parser.add_argument("--repeats", type=int, default=6)

@@ -15,12 +15,12 @@ uploaded again in every frame, so keep below 40M.
 
 from __future__ import annotations
 
-import argparse
 import time
 from functools import partial
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+import asked
 import numpy as np
 
 from lpc.attributes import Attribute
@@ -146,11 +146,11 @@ def milliseconds(draw: Callable[[], Any]) -> list[float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = asked.parser(__doc__)
     parser.add_argument("backend", nargs="?", choices=("cpu", "gl"), default="cpu")
-    parser.add_argument("--samples", default="4M")
+    parser.add_argument("--samples", type=asked.samples, default=4_000_000)
     options = parser.parse_args()
-    samples = int(float(options.samples.removesuffix("M")) * 1e6)
+    samples = options.samples
     header, clouds = sphere_clouds(samples)
     camera = front(SIZE)
     for threads in (1, 2) if options.backend == "cpu" else (1,):

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lpc.errors import LpcError, ScanError
+from lpc.info import counted
 
 from .arguments import BOUNDS, COUNT, DEEPEST, POSITIVE
 from .cache import Cache
@@ -74,7 +75,7 @@ def verify(model: str, scans: tuple[str, ...], more: tuple[str, ...], as_json: b
     if more and not scans:
         raise click.UsageError(f"{more[0]}: scans to compare with stand after --against")
     open_scan = _scan_reader() if scans else None
-    opened = [open_scan(path) for path in (*scans, *more)] if open_scan is not None else []
+    opened = [open_scan(path, attributes="all") for path in (*scans, *more)] if open_scan is not None else []
     report = asyncio.run(_verify(model, opened))
     if as_json:
         click.echo(json.dumps(report.to_json()))
@@ -128,7 +129,7 @@ def export(
         )
         dropped = write_points(out, _batches(opened, "exporting", count, choice), target)
         complete = opened.complete
-    click.echo(f"{out}: {count} samples" + ("" if complete else " of a file that is cut short"), err=True)
+    click.echo(f"{out}: {counted(count, 'sample')}" + ("" if complete else " of a file that is cut short"), err=True)
     for name in dropped:
         click.echo(f"{out}: left out {name}, the format has no room for it", err=True)
 
@@ -138,7 +139,7 @@ def export(
 @click.argument("folder", metavar="DIR", type=click.Path(file_okay=False, path_type=Path))
 @click.option("--bounds", type=BOUNDS, help="X0,Y0,Z0,X1,Y1,Z1 in model units: only clouds that touch it.")
 @click.option("--spacing", type=POSITIVE, help="Detail that is enough, model units.")
-@click.option("--bytes", "most_bytes", type=COUNT, help="Size of the copy, at most; coarse comes first.")
+@click.option("--bytes", "most_bytes", type=COUNT, help="Bytes of it to have at most; coarse comes first.")
 @JSON
 def fetch(
     model: str,
@@ -173,7 +174,9 @@ def fetch(
     if as_json:
         click.echo(json.dumps(report.to_json()))
     else:
-        part = "the whole model" if report.complete else f"{report.clouds} of {report.clouds_total} clouds"
+        part = "the whole model" if report.complete else f"{report.clouds:,} of {counted(report.clouds_total, 'cloud')}"
+        if report.cut_short:
+            part += " of a file that is cut short"
         click.echo(
             f"{out}: {part}, {report.bytes:,} of {report.bytes_total:,} bytes, {report.bytes_fetched:,} of them new"
         )
@@ -200,7 +203,7 @@ async def _verify(target: str, scans: list[Scan]) -> VerifyReport:
         await store.close()
 
 
-def _scan_reader() -> Callable[[str], Scan]:
+def _scan_reader() -> Callable[..., Scan]:
     """Find what reads scans: another package's trade, met by the name of an entry point."""
     for point in entry_points(group="pointstream.readers", name="scan"):
         return point.load()
@@ -223,12 +226,15 @@ def _rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     low, high = facts["bounds"]
     bits = facts["bits_per_sample"]
     yield "format", facts["format"]
-    yield "samples", f"{facts['samples']:,} in {facts['clouds']:,} clouds of at most {facts['cloud_size']:,}"
+    yield "samples", f"{facts['samples']:,} in {counted(facts['clouds'], 'cloud')} of at most {facts['cloud_size']:,}"
     yield "levels", str(facts["levels"])
     yield "bytes", f"{facts['bytes']:,}"
     if not facts["complete"]:
         here = facts["here"]
-        yield "incomplete", f"here is a coarser model: {here['samples']:,} of the samples in {here['clouds']:,} clouds"
+        yield (
+            "incomplete",
+            f"here is a coarser model: {here['samples']:,} of the samples in {counted(here['clouds'], 'cloud')}",
+        )
     yield "bits per sample", ", ".join(f"{name} {value:.2f}" for name, value in bits.items() if value)
     yield "spacing", f"{facts['spacing']:.6g}"
     yield "spacing, stored / LPC", " ".join(f"{ratio:.3f}" for ratio in facts["spacing_ratio"]) + "  (5%, 50%, 95%)"
@@ -250,7 +256,7 @@ def _rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "left out", f"{', '.join(names)}: {why}"
     for why, count in facts["rejected"].items():
         if count:
-            yield f"rejected: {why}", f"{count:,} records"
+            yield f"rejected: {why}", counted(count, "record")
     yield "build", facts["digest"]
 
 
@@ -276,7 +282,7 @@ def crs_name(wkt: str) -> str:
 
 
 def _print_report(report: VerifyReport) -> None:
-    click.echo(f"{report.clouds_checked} of {report.clouds} clouds checked")
+    click.echo(f"{report.clouds_checked:,} of {counted(report.clouds, 'cloud')} checked")
     if (match := report.match) is not None:
         click.echo(
             f"samples of the scans {match.samples_in}, of the model {match.samples_out}, missing {match.missing}"
@@ -286,6 +292,9 @@ def _print_report(report: VerifyReport) -> None:
             click.echo(f"largest normal error {match.max_normal_error_degrees:.4f} degrees")
         if match.max_color_error is not None:
             click.echo(f"largest colour error {match.max_color_error}")
+        click.echo(f"compared: {', '.join(['position', *match.differing])}")
+        for name, why in match.not_compared.items():
+            click.echo(f"not compared: {name}, {why}")
     for problem in report.problems:
         click.echo(f"problem: {problem}")
     click.echo("ok" if report.ok else "not ok")

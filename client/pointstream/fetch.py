@@ -17,7 +17,9 @@ import numpy as np
 from lpc.errors import Corrupt, FormatError, StoreError, Unavailable
 from lpc.header import HEADER_PROBE, Header, compute_digest, parse_header
 from lpc.page import PAGE_HEADER
+from lpc.ranges import ByteRange
 
+from .lineage import Untold
 from .reading import EVERYTHING, Reader, ReadingOptions, Region
 from .stores.cached import CachedStore
 from .stores.sparse import SparseFile, map_path
@@ -46,7 +48,8 @@ class FetchOptions:
     ----------
     region : Region
     most_bytes : int, optional
-        Bytes of the copy, at most; the coarsest clouds of the region come first.
+        Bytes of the model in the copy, at most, whatever brought them; the coarsest come first. A copy that holds more
+        already keeps it.
     patience : float
         Seconds to wait for a host that gives nothing.
     """
@@ -71,6 +74,8 @@ class FetchReport:
         Those of them that came in this run.
     complete : bool
         The copy is the model, byte for byte.
+    cut_short : bool
+        The model that it was copied from is not all there itself.
     problems : tuple of str
         Clouds that stayed damaged.
     """
@@ -82,6 +87,7 @@ class FetchReport:
     bytes_total: int
     bytes_fetched: int
     complete: bool
+    cut_short: bool = False
     problems: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
@@ -92,8 +98,10 @@ class FetchReport:
 class Copy:
     """The one file that is filled: what a cache is to `CachedStore`."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, most_bytes: int | None = None) -> None:
         self.path = path
+        self._most_bytes = most_bytes
+        self._file: SparseFile | None = None
 
     def __str__(self) -> str:
         return str(self.path)
@@ -127,12 +135,15 @@ class Copy:
             raise StoreError(f"{self.path} holds another build of the model: move it away, or name another folder")
         if there is None and self.path.exists() and not map_path(self.path).is_file():
             raise StoreError(f"{self.path} is something else: move it away, or name another folder")
-        return SparseFile(self.path, length=header.bytes, tag=header.tag)
+        self._file = SparseFile(self.path, length=header.bytes, tag=header.tag)
+        return self._file
 
     def room(self, keep: Path, size: int) -> int:
-        """Set no bound but the disk's."""
+        """Set no bound but the disk's, and the one that was asked for."""
         del keep, size
-        return 1 << 62
+        if self._most_bytes is None or self._file is None:
+            return 1 << 62
+        return max(0, self._most_bytes - self._file.present.total)
 
     def clear(self, entry: Path) -> bool:
         """Throw nothing of a person's away."""
@@ -178,7 +189,7 @@ async def fetch(
         If the host fails for longer than the patience or the file cannot be written; what came stays.
     """
     options = options or FetchOptions()
-    filled = CachedStore(store, Copy(out))
+    filled = CachedStore(store, Copy(out, options.most_bytes))
     try:
         fetching = _Fetching(filled, out, options)
         return await fetching.run(begin)
@@ -196,10 +207,14 @@ class _Fetching:
 
     async def run(self, begin: Callable[[int], Callable[[int], None]]) -> FetchReport:
         self.reader = await Reader.open(self.store, ReadingOptions(max_bytes=RUN))
+        self._check_least()
+        await self.store.flush()  # what came is on its way to the disk
         self._check_disk()
         if self.reader.index.header.digest != self.store.cache.last_build(self.store.name):
             raise StoreError(f"{self.out} cannot be written: name another folder")
-        nodes = await self._waiting_for_host(lambda: self.reader.select(self.options.region))
+        most = self.options.most_bytes
+        nodes = await self._waiting_for_host(lambda: self.reader.select(self.options.region, most_bytes=most))
+        await self.store.flush()
         nodes = self._within_budget(nodes)
         missing = self._missing(nodes)
         size = int(self.reader.index.size[missing].sum())
@@ -214,6 +229,12 @@ class _Fetching:
             self._check_disk()
         return self._report(nodes, size)
 
+    def _check_least(self) -> None:
+        index, most = self.reader.index, self.options.most_bytes
+        least = index.page_range(0).stop
+        if most is not None and most < least:
+            raise StoreError(f"{self.out}: {most:,} bytes hold no copy; header and first page alone take {least:,}")
+
     def _check_disk(self) -> None:
         if self.store.broken is not None:
             raise StoreError(self.store.broken.replace(": going on without it", ""))
@@ -227,15 +248,19 @@ class _Fetching:
         if self.options.most_bytes is None:
             return nodes
         index = self.reader.index
-        pages = sum(index.page_range(page).size for page in np.flatnonzero(index.page_loaded).tolist())
-        total = index.header.page0 + pages + np.cumsum(index.size[nodes])
-        return nodes[total <= self.options.most_bytes]
+        pages = np.unique(nodes // index.header.page_nodes)
+        kept = [self.store.holds(*_ends(index.page_range(page)))[0] for page in pages.tolist()]
+        nodes = nodes[np.isin(nodes // index.header.page_nodes, pages[kept])]  # of no use without their pages
+        cost = np.where(
+            self.store.holds(index.offset[nodes], index.offset[nodes] + index.size[nodes]), 0, index.size[nodes]
+        )
+        return nodes[self.store.held_bytes + np.cumsum(cost) <= self.options.most_bytes]
 
     async def _bring(self, nodes: NDArray[np.int64], advance: Callable[[int], None]) -> None:
         index = self.reader.index
         async for node, cloud in self.reader.clouds(self._missing(nodes)):
             advance(int(index.size[node]))
-            if isinstance(cloud, Corrupt):
+            if isinstance(cloud, Corrupt) and not isinstance(cloud, Untold):
                 self.problems[node] = str(cloud)
             if self.store.waiting > WAITING:
                 await self.store.flush()
@@ -287,7 +312,7 @@ class _Fetching:
         left = int(index.size[self._missing(nodes)].sum())
         known = np.flatnonzero(index.known)
         held = self.store.holds(index.offset[known], index.offset[known] + index.size[known])
-        whole = bool(self.store.holds(np.array([0]), np.array([index.header.bytes]))[0])
+        whole = bool(self.store.holds(*_ends(ByteRange(0, index.header.bytes)))[0])
         return FetchReport(
             path=str(self.out),
             clouds=int(held.sum()),
@@ -296,5 +321,10 @@ class _Fetching:
             bytes_total=index.header.bytes,
             bytes_fetched=size - left,
             complete=whole,
+            cut_short=not self.reader.complete,
             problems=tuple(f"{text}; it is missing in the copy" for text in self.problems.values()),
         )
+
+
+def _ends(place: ByteRange) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    return np.array([place.start]), np.array([place.stop])

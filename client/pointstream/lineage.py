@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import TYPE_CHECKING
 
-from lpc.context import ANCESTORS
+from lpc.context import ANCESTORS, has_context
 from lpc.errors import Corrupt
 
 if TYPE_CHECKING:
@@ -19,15 +19,13 @@ Family = dict[int, "Cloud | Corrupt"]
 
 
 def ancestors(index: IndexTree, node: int) -> list[int]:
-    """Nodes that a cloud is guessed from, from the root down; its page and theirs are loaded."""
-    if all(attribute.kind == "scalar" for attribute in index.header.attributes):
+    """Nodes that a cloud is guessed from, from the root down, as far as pages say."""
+    if not has_context(index.header.attributes):
         return []
-    line: list[int] = []
-    above = int(index.parent[node])
-    while above >= 0 and len(line) < ANCESTORS:
-        line.append(above)
-        above = int(index.parent[above])
-    return line[::-1]
+    line = [node]
+    while len(line) <= ANCESTORS and line[-1] > 0 and index.linked[line[-1]]:
+        line.append(int(index.parent[line[-1]]))
+    return line[:0:-1]
 
 
 def context(index: IndexTree, node: int, family: Mapping[int, Cloud | Corrupt]) -> list[Cloud]:
@@ -36,10 +34,12 @@ def context(index: IndexTree, node: int, family: Mapping[int, Cloud | Corrupt]) 
     Raises
     ------
     Corrupt
-        If one of them is damaged: `Untold`.
+        If one of them is damaged, or a page that says which they are: `Untold`.
     """
-    clouds = []
-    for above in ancestors(index, node):
+    clouds, line = [], ancestors(index, node)
+    if has_context(index.header.attributes) and len(line) < ANCESTORS and (line or [node])[0] > 0:
+        raise Untold(f"cloud {node}: the page that says what it is told from is not here")
+    for above in line:
         cloud = family[above]
         if isinstance(cloud, Corrupt):
             raise Untold(f"cloud {node}: it is told from one that is damaged ({cloud})")

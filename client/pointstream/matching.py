@@ -58,6 +58,8 @@ class MatchReport:
     differing : dict of str to int
         Partners whose values differ by more than the model allows, by attribute; for normals: one has a normal and the
         other none.
+    not_compared : dict of str to str
+        The model's other attributes, and why.
     """
 
     samples_in: int = 0
@@ -68,6 +70,7 @@ class MatchReport:
     max_normal_error_degrees: float | None = None
     max_color_error: int | None = None
     differing: dict[str, int] = field(default_factory=dict)
+    not_compared: dict[str, str] = field(default_factory=dict)
 
 
 class Matcher:
@@ -78,7 +81,7 @@ class Matcher:
     header : Header
         Of the model: lattice and attributes.
     names : sequence of str
-        Attributes to compare.
+        Attributes to compare, with the model's value those that have one everywhere.
     folder : Path
         For the bucket files.
     """
@@ -94,7 +97,10 @@ class Matcher:
             [self._stack.enter_context((folder / f"{side}{number}").open("w+b")) for number in range(self._count)]
             for side in ("in", "out")
         ]
-        self.report = MatchReport(differing={attribute.name: 0 for attribute in self._attributes})
+        self._constants = {name: constant for name, constant in header.constants.items() if name in names}
+        self.report = MatchReport(
+            differing=dict.fromkeys([*(item.name for item in self._attributes), *self._constants], 0)
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -107,6 +113,8 @@ class Matcher:
         with np.errstate(invalid="ignore"):  # a sample beyond all lattices simply has no partner
             lattice = quantise(xyz, np.asarray(self._header.origin), self._header.step)
         self.report.samples_in += len(xyz)
+        for name, constant in self._constants.items():
+            self.report.differing[name] += _differ(values[name], constant.fill(len(xyz)))
         self._spread(0, lattice, xyz, values)
 
     def add_out(self, lattice: NDArray[np.int64], values: Mapping[str, NDArray[Any]]) -> None:
@@ -226,7 +234,7 @@ def _differ(a: NDArray[Any], b: NDArray[Any]) -> int:
     different = a != b
     if a.dtype.kind == "f":
         different &= ~(np.isnan(a) & np.isnan(b))
-    return int(different.sum())
+    return int(different.reshape(len(a), -1).any(axis=1).sum())
 
 
 def _angles(a: NDArray[np.float32], b: NDArray[np.float32]) -> tuple[float, int]:

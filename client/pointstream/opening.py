@@ -27,6 +27,8 @@ class Opening:
         As soon as page 0 is there, or when the file is known to end before it (then without any node).
     needed : int
         Bytes of prefix that the next step takes; what is there may be more.
+    used : int
+        Bytes of the prefix that header and page 0 take, as far as they are there.
 
     Parameters
     ----------
@@ -38,6 +40,7 @@ class Opening:
         self.header: Header | None = None
         self.index: IndexTree | None = None
         self.needed = probe
+        self.used = 0
 
     def look(self, data: bytes | bytearray, *, ended: bool = False) -> bool:
         """Take in a prefix that has grown; True once the index is there.
@@ -72,6 +75,7 @@ class Opening:
         elif not ended:
             return False
         self.index = index
+        self.used = page.stop if index.page_loaded[0] else self.header.page0
         return True
 
 
@@ -98,7 +102,7 @@ async def open_index(store: Store) -> tuple[IndexTree, bytes]:
     """
     opening, data = Opening(await store.opening_bytes()), b""
     while True:
-        part = await store.read(ByteRange(len(data), opening.needed))
+        part = b"" if hole_at(store, len(data)) else await store.read(ByteRange(len(data), opening.needed))
         data += part
         try:
             done = opening.look(data, ended=len(data) < opening.needed or not part)
@@ -110,6 +114,11 @@ async def open_index(store: Store) -> tuple[IndexTree, bytes]:
             if vouch_opening(store, opening, data):
                 _vouch_clouds(store, opening.index, data)
             return opening.index, data
+
+
+def hole_at(store: Store, place: int) -> bool:
+    """Whether what a store gives of this place is not the model's: for an opening, the file ends there."""
+    return store.partial and not store.holds(np.array([place]), np.array([place + 1]))[0]
 
 
 def vouch_opening(store: Store, opening: Opening, data: bytes | bytearray) -> bool:

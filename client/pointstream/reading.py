@@ -11,16 +11,18 @@ from collections import ChainMap, deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import compress
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lpc.context import has_context
 from lpc.errors import Corrupt, ModelChanged
 from lpc.page import page_bytes
 from lpc.ranges import ByteRange, coalesce
 
 from .decoding import decode_checked
-from .lineage import Family, Lineage, ancestors
+from .lineage import Family, Lineage, Untold, ancestors
 from .opening import add_page, open_index
 
 if TYPE_CHECKING:
@@ -69,7 +71,8 @@ class Region:
     bounds : tuple of 6 floats, optional
         x0, y0, z0, x1, y1, z1, model units, both ends included.
     spacing : float, optional
-        Detail that is enough, model units: a node is refined while its spacing is larger.
+        Detail that is enough, model units: a node is refined while a picture that ends at it is coarser, as refinement
+        for the screen has it (`lpc.density`).
     level : int, optional
         Deepest level, 0 for the root.
     """
@@ -100,7 +103,7 @@ class Region:
         """Which nodes are too coarse."""
         more = np.ones(len(nodes), dtype=bool)
         if self.spacing is not None:
-            more &= index.spacing[nodes] > self.spacing
+            more &= index.density.coarseness[nodes] > self.spacing
         if self.level is not None:
             more &= index.level[nodes] < self.level
         return more
@@ -164,24 +167,52 @@ class Reader:
         here = stops <= self.length
         return np.asarray(here & self.store.holds(starts, stops) if self.store.partial else here)
 
-    async def select(self, region: Region = EVERYTHING) -> NDArray[np.int64]:
+    async def select(self, region: Region = EVERYTHING, *, most_bytes: int | None = None) -> NDArray[np.int64]:
         """Find the nodes of a region, reading pages as needed; nodes that the file no longer has are left out.
+
+        Parameters
+        ----------
+        region : Region
+        most_bytes : int, optional
+            Look no deeper once the nodes of some levels have more bytes than that.
 
         Raises
         ------
         StoreError, FormatError
         """
-        index, found = self.index, []
+        index = self.index
+        while True:
+            loaded = int(index.page_loaded.sum())
+            nodes = await self._descend(region, most_bytes)
+            if region.spacing is None or int(index.page_loaded.sum()) == loaded:
+                break  # pages of uneven cells tell how coarse the nodes above them are
+        nodes = nodes[self._there(nodes)]
+        if self.store.partial and has_context(index.header.attributes):  # nor what is told from those
+            here = np.zeros(len(index), dtype=bool)
+            here[nodes] = True
+            while not (told := here[index.parent[nodes]] | (nodes == 0)).all():
+                here[nodes[~told]] = False
+                nodes = nodes[told]
+        return nodes
+
+    def _there(self, nodes: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which clouds are there."""
+        return self.reaches(self.index.offset[nodes], self.index.offset[nodes] + self.index.size[nodes])
+
+    async def _descend(self, region: Region, most_bytes: int | None) -> NDArray[np.int64]:
+        """Go down the tree by what its pages say now; return nodes in order."""
+        index, found, size = self.index, [], 0
         frontier = np.zeros(1, dtype=np.int64)
-        while len(frontier):
+        while len(frontier) and (most_bytes is None or size <= most_bytes):
             await self.load_pages(frontier)
             frontier = frontier[index.known[frontier]]
             frontier = frontier[region.touches(index, frontier)]
             found.append(frontier)
-            children = index.children[frontier[region.deeper(index, frontier)]].ravel()
-            frontier = children[children >= 0].astype(np.int64)
-        nodes = np.sort(np.concatenate(found))
-        return nodes[self.reaches(index.offset[nodes], index.offset[nodes] + index.size[nodes])]
+            size += int(index.size[frontier].sum())
+            if region.spacing is not None:
+                await self.load_pages(_children(index, frontier))
+            frontier = _children(index, frontier[region.deeper(index, frontier)])
+        return np.sort(np.concatenate(found))
 
     async def present(self) -> NDArray[np.int64]:
         """Find all nodes that are there; those that only a damaged page leads to are not found.
@@ -192,8 +223,8 @@ class Reader:
         """
         with suppress(Corrupt):
             await self.select()
-        index = self.index
-        return np.flatnonzero(index.known & self.reaches(index.offset, index.offset + index.size))
+        nodes = np.flatnonzero(self.index.known)
+        return nodes[self._there(nodes)]
 
     async def load_pages(self, nodes: NDArray[np.int64]) -> None:
         """Read the pages of these nodes, as far as the file reaches.
@@ -217,6 +248,8 @@ class Reader:
 
     async def clouds(self, nodes: NDArray[np.int64]) -> AsyncIterator[tuple[int, Cloud | Corrupt]]:
         """Give the clouds of nodes in file order, each as soon as its turn comes; one that stays damaged as an error.
+
+        A sound cloud that is told from a damaged one is an `Untold`.
 
         Raises
         ------
@@ -299,6 +332,9 @@ class Reader:
     ) -> list[tuple[int, Cloud | Corrupt]]:
         """Decode the nodes of a run, after those of their ancestors that are not at hand."""
         family, missing = lineage.family(nodes)
+        gone = ~self._there(np.array(missing, dtype=np.int64))
+        family |= {node: Corrupt(f"cloud {node}: it is not in this copy") for node in compress(missing, gone)}
+        missing = [node for node in missing if node not in family]
         order = sorted([*nodes, *missing])
         parts = {node: bytes(place.within(body, self.index.cloud_range(node))) for node in nodes}
         for start in range(0, len(missing), self.options.parallel):
@@ -315,15 +351,20 @@ class Reader:
         ):
             family |= found
         for node in order:
-            for _ in range(self.options.tries):
-                if not isinstance(family[node], Corrupt):
-                    break
-                if not any(isinstance(family[above], Corrupt) for above in ancestors(self.index, node)):
-                    self._reject(self.index.cloud_range(node))
-                    parts[node] = await self.read(self.index.cloud_range(node))
+            place, tries = self.index.cloud_range(node), self.options.tries
+            while isinstance(family[node], Corrupt):
+                if isinstance(family[node], Untold):
+                    if any(isinstance(family[above], Corrupt) for above in ancestors(self.index, node)):
+                        break
+                else:
+                    tries -= 1
+                    if tries == 0:
+                        break
+                    self._reject(place)
+                    parts[node] = await self.read(place)
                 family |= await loop.run_in_executor(threads, self._decode, [node], parts, family)
-            if not isinstance(family[node], Corrupt):
-                self.store.vouch(self.index.cloud_range(node), parts[node])
+            if isinstance(family[node], Untold) or not isinstance(family[node], Corrupt):
+                self.store.vouch(place, parts[node])
         lineage.keep(family)
         return [(node, family[node]) for node in nodes]
 
@@ -337,3 +378,8 @@ class Reader:
             except Corrupt as error:
                 found[node] = error
         return found
+
+
+def _children(index: IndexTree, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+    children = index.children[nodes].ravel()
+    return children[children >= 0].astype(np.int64)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lpc.context import has_context, line_of
 from lpc.errors import Corrupt, FormatError, LpcError, ModelChanged, StoreError, Unavailable
 from lpc.header import HEADER_PROBE
 from lpc.ranges import ByteRange
@@ -20,7 +21,7 @@ from .build import Arrived, Build
 from .decoding import Decoder
 from .foresight import Foresight
 from .offers import Item, Request
-from .opening import Opening, add_page, naming, vouch_opening
+from .opening import Opening, add_page, hole_at, naming, vouch_opening
 from .recovery import Recovery
 from .scheduler import LinkState, Scheduler
 from .stats import ErrorLog, ErrorReport
@@ -120,7 +121,11 @@ class Traffic:
         """
         keys, starts, stops, held = build.places(pages, nodes)
         self.local.offer(keys[held], starts[held], stops[held])
-        self.scheduler.offer(keys[~held], starts[~held], stops[~held])
+        line = 0  # the first want may wait for its ancestors: what these bring along would delay it
+        while line + 1 < len(nodes) and nodes[line] in line_of(int(nodes[line + 1]), build.index.parent):
+            line += 1
+        alone = nodes[: line + 1] if line else None
+        self.scheduler.offer(keys[~held], starts[~held], stops[~held], alone=alone)
         self.issue()
 
     def offer_ahead(self, build: Build, pages: NDArray[np.int64], nodes: NDArray[np.int64]) -> None:
@@ -192,7 +197,7 @@ class Traffic:
             nonlocal build
             if build is None and opening.look(assembly.data, ended=ended):
                 build = self._begin(opening, assembly.data)
-                assembly.used = opening.needed
+                assembly.used = opening.used
                 self._claim(build, request, assembly, np.flatnonzero(build.index.known))
                 if opened is not None:
                     opened.set_result(None)
@@ -207,8 +212,9 @@ class Traffic:
             request.range = ByteRange(0, await self.store.opening_bytes())
             data = await self.store.read(request.range, sink)
             look(ended=len(data) < request.range.size)
-            while build is None:  # the header is larger than the probe
-                await self.store.read(ByteRange(len(assembly.data), opening.needed), sink)
+            while build is None:  # the header is larger than the probe, or the first page is not here
+                if not hole_at(self.store, len(assembly.data)):
+                    await self.store.read(ByteRange(len(assembly.data), opening.needed), sink)
                 look(ended=len(assembly.data) < opening.needed)
             build.tail = assembly.rest()
             self._recovery.answered()
@@ -228,7 +234,7 @@ class Traffic:
         """Take what was just opened for the model, in one step, if it is another build than the one at hand."""
         assert opening.index is not None
         header = opening.index.header
-        self.payload += opening.needed
+        self.payload += opening.used
         self._stale = False
         if self.build is not None and self.build.index.header.digest == header.digest:
             self.store.forget(distrust_tags=True)  # the tag changed and the model did not
@@ -363,7 +369,9 @@ class Traffic:
 
     def _damaged(self, build: Build, key: int, error: FormatError) -> None:
         if build.failed(key, self._options.tries):
-            self.errors.add("page" if key < 0 else "cloud", f"{self.store.name}: {error}; it stays missing")
+            below = key >= 0 and has_context(build.index.header.attributes) and (build.index.children[key] >= 0).any()
+            what = "it stays missing, and what is below it" if below else "it stays missing"
+            self.errors.add("page" if key < 0 else "cloud", f"{self.store.name}: {error}; {what}")
             self.wanted.came(self._clock(), key)
 
     def _failed(self, error: LpcError) -> None:

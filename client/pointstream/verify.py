@@ -12,6 +12,7 @@ import numpy as np
 from lpc.codec import cloud_to_points
 from lpc.errors import Corrupt
 from lpc.header import compute_digest
+from lpc.info import counted
 from lpc.octahedral import max_error_degrees
 from lpc.page import PAGE_HEADER
 
@@ -101,6 +102,7 @@ class VerifyReport:
                 "max_normal_error_degrees": match.max_normal_error_degrees,
                 "max_color_error": match.max_color_error,
                 "attributes_differing": dict(match.differing),
+                "not_compared": dict(match.not_compared),
             }
         return entry
 
@@ -134,18 +136,19 @@ async def verify(
             if reader.store.partial
             else f"is cut short: {reader.length} of {header.bytes} bytes are here"
         )
-        problems.add(f"the file {what}, {header.nodes - len(nodes)} of {header.nodes} clouds are missing")
+        problems.add(f"the file {what}, {header.nodes - len(nodes)} of {counted(header.nodes, 'cloud')} are missing")
     elif reader.index.page_loaded.all():
         await _check_digest(reader, problems)
+    compared, not_compared = _comparable(header, scans)
     with (
         tempfile.TemporaryDirectory(prefix="pointstream-") as folder,
-        Matcher(header, _comparable(header, scans), Path(folder)) as matcher,
+        Matcher(header, compared, Path(folder)) as matcher,
     ):
-        samples = untold = 0
+        samples = untold = lost = 0
         async for node, cloud in reader.clouds(nodes):
             advance(1)
             if isinstance(cloud, Untold):
-                untold += 1
+                untold, lost = untold + 1, lost + int(index.samples[node])
                 continue
             if isinstance(cloud, Corrupt):
                 problems.add(str(cloud))
@@ -156,9 +159,13 @@ async def verify(
             if scans:
                 matcher.add_out(cloud.lattice(), points.attributes)
         if untold:
-            problems.add(f"{untold} sound clouds cannot be decoded, because they are told from damaged ones")
+            problems.add(
+                f"{counted(untold, 'sound cloud')} of {counted(lost, 'sample')} cannot be decoded: they are told from "
+                "clouds that are damaged or missing"
+            )
         if complete and samples != header.samples:
             problems.add(f"the clouds hold {samples} samples, the header says {header.samples}")
+        matcher.report.not_compared = not_compared
         match = _match(matcher, scans, header, problems) if scans else None
     return VerifyReport(
         clouds=header.nodes, clouds_checked=len(nodes), complete=complete, problems=problems.texts, match=match
@@ -203,7 +210,8 @@ async def _load_all_pages(reader: Reader, problems: _Problems) -> None:
                     problems.add(str(error))
     if damaged:
         hidden = index.header.nodes - int(index.known.sum())
-        problems.add(f"{len(damaged)} damaged pages hide {hidden} of {index.header.nodes} clouds")
+        clouds, behind = counted(index.header.nodes, "cloud"), counted(len(damaged), "damaged page")
+        problems.add(f"{hidden} of {clouds} cannot be found behind {behind}")
 
 
 async def _check_digest(reader: Reader, problems: _Problems) -> None:
@@ -251,14 +259,21 @@ def _check_cones(
         problems.add(f"cloud {node}: normals stand outside the cone of node {worst}")
 
 
-def _comparable(header: Header, scans: Sequence[Scan]) -> list[str]:
-    """Attributes of the model that every scan has in the same dtype (the builder widens where they differ)."""
-    names = []
-    for item in header.attributes:
-        dtypes = {scan.info.attributes.get(item.name) for scan in scans}
-        if dtypes == {np.dtype(item.dtype)}:
-            names.append(item.name)
-    return names
+def _comparable(header: Header, scans: Sequence[Scan]) -> tuple[list[str], dict[str, str]]:
+    """Attributes of the model that every scan has in the model's dtype, and why the others are not compared."""
+    names, others = [], {}
+    dtypes = {item.name: np.dtype(item.dtype) for item in header.attributes}
+    dtypes |= {name: np.dtype(constant.dtype) for name, constant in header.constants.items()}
+    for name, dtype in dtypes.items():
+        found = [scan.info.attributes[name] for scan in scans if name in scan.info.attributes]
+        theirs = {item.newbyteorder("=").name for item in found}
+        if len(found) < len(scans):
+            others[name] = "not in all of the scans" if theirs else "not in the scans"
+        elif theirs == {dtype.name}:
+            names.append(name)
+        else:
+            others[name] = f"{dtype} in the model, {' and '.join(sorted(theirs))} in the scans"
+    return names, others
 
 
 def _match(matcher: Matcher, scans: Sequence[Scan], header: Header, problems: _Problems) -> MatchReport:
@@ -279,7 +294,7 @@ def _match(matcher: Matcher, scans: Sequence[Scan], header: Header, problems: _P
         problems.add(f"a normal is {worst:.3f} degrees off, more than the bound {max_error_degrees(bits):.3f}")
     for name, count in match.differing.items():
         if count:
-            allowed = next(item.max_error for item in header.attributes if item.name == name)
+            allowed = next((item.max_error for item in header.attributes if item.name == name), 0)
             beyond = f" by more than the {allowed} that are allowed" if allowed else ""
             problems.add(f"{name} differs in {count} samples{beyond}")
     return match

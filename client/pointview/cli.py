@@ -5,99 +5,29 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import click
 
-from lpc.errors import FormatError
-from pointstream.arguments import COUNT, POSITIVE, Number
+from lpc.info import counted
+from pointstream.arguments import COUNT, Number
 from pointstream.cli import CACHE, choose_cache
+
+from .arguments import LARGEST_SIDE, TOLERANCE, PathType, SizeType, ViewType
 
 if TYPE_CHECKING:
     from lpc.header import Header
-    from pointlink.profiles import Profile
     from pointstream.cache import Cache
 
     from .refine import Cut
     from .still import StillOptions
+    from .stream.path import ViewPath
 
-LARGEST_SIDE = 16384
 MOST_THREADS = 8
 MOST_PICTURES = 100_000
 MOST_ANTIALIAS = 8
-
-
-class SizeType(click.ParamType[tuple[int, int]]):
-    """WIDTHxHEIGHT, pixels."""
-
-    name = "WxH"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
-        """Return (width, height)."""
-        if isinstance(value, tuple):
-            return value
-        match = re.fullmatch(r"(\d{1,6})[xX](\d{1,6})", str(value).strip())
-        if match is None:
-            self.fail(f"{value!r} is no size; write for example 1024x768", param, ctx)
-        width, height = int(match[1]), int(match[2])
-        if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
-            self.fail(f"{value!r}: sides are 1 to {LARGEST_SIDE} pixels", param, ctx)
-        return width, height
-
-
-class ViewType(click.ParamType[dict[str, Any]]):
-    """A VIEW.json file."""
-
-    name = "VIEW.json"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> dict[str, Any]:
-        """Return the object; that it is a view is checked by `Camera.from_view`.
-
-        Raises
-        ------
-        FormatError
-            If the file holds no JSON object.
-        """
-        if isinstance(value, dict):
-            return value
-        try:
-            view = json.loads(Path(value).read_text(encoding="utf-8"))
-        except OSError as error:
-            self.fail(f"cannot read {value}: {error.strerror}", param, ctx)
-        except (ValueError, RecursionError) as error:
-            raise FormatError(f"{value} is not JSON; a view is an object with eye, target, up and fov_y") from error
-        if not isinstance(view, dict):
-            raise FormatError(f"{value} is no view: an object with eye, target, up and fov_y")
-        return view
-
-
-def read_link(text: str) -> Profile:
-    """Read the option ``--link``.
-
-    Raises
-    ------
-    click.BadParameter
-        If it is none.
-    """
-    from pointlink.profiles import parse_profile
-
-    try:
-        return parse_profile(text)
-    except ValueError as error:
-        raise click.BadParameter(str(error), param_hint="--link") from error
-
-
-TOLERANCE = click.option(
-    "--tolerance",
-    type=POSITIVE,
-    default=1.0,
-    show_default=True,
-    help="Spacing of samples on the screen that is fine enough, pixels.",
-)
-"""The option of every command that refines."""
 
 
 @click.command()
@@ -123,7 +53,7 @@ TOLERANCE = click.option(
     help="Draw so many times wider and higher, and show the mean.",
 )
 @click.option("--two-sided", is_flag=True, help="Show surfaces from behind too: for normals that may point inward.")
-@click.option("--path", type=click.Path(path_type=Path, dir_okay=False), help="PATH.json: a picture at each time.")
+@click.option("--path", type=PathType(), help="PATH.json: a picture at each time.")
 @click.option("--turntable", type=click.IntRange(min=2, max=MOST_PICTURES), help="So many pictures around the model.")
 @click.option(
     "--fps",
@@ -141,7 +71,10 @@ TOLERANCE = click.option(
 )
 @CACHE
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+@click.pass_context
 def render(
+    context: click.Context,
+    /,
     model: str,
     out: Path,
     size: tuple[int, int],
@@ -152,7 +85,7 @@ def render(
     splat: Any,
     antialias: int,
     two_sided: bool,
-    path: Path | None,
+    path: ViewPath | None,
     turntable: int | None,
     fps: float,
     animation: str,
@@ -170,6 +103,9 @@ def render(
     many = path is not None or turntable is not None
     if out.suffix.lower() not in FORMATS and (out.suffix or not many):
         raise click.UsageError(f"{out}: the suffix says the format; use one of {', '.join(FORMATS)}")
+    for name in () if many else ("fps", "animation"):
+        if context.get_parameter_source(name) != click.core.ParameterSource.DEFAULT:
+            raise click.UsageError(f"--{name} is of many pictures: give --path or --turntable too")
     width, height = size
     if max(size) * antialias > LARGEST_SIDE:
         raise click.UsageError(f"{width}x{height} with --antialias {antialias} is above {LARGEST_SIDE} pixels a side")
@@ -200,7 +136,7 @@ def render(
         figures = still.report
         starved = f", {figures['starved_clouds']} of them starved" if figures["starved_clouds"] else ""
         click.echo(
-            f"{out}: {figures['splats']:,} splats of {figures['clouds']:,} clouds{starved},"
+            f"{out}: {counted(figures['splats'], 'splat')} of {counted(figures['clouds'], 'cloud')}{starved},"
             f" {figures['frame_ms']:.1f} ms on {figures['backend']}, {figures['bytes_read']:,} bytes read"
         )
 
@@ -209,7 +145,7 @@ def _sequence(
     model: str,
     out: Path,
     options: StillOptions,
-    path: Path | None,
+    path: ViewPath | None,
     turntable: int | None,
     fps: float,
     animation: str,
@@ -221,9 +157,8 @@ def _sequence(
 
     from .camera import Camera
     from .sequence import draw_sequence, path_views, turntable_views
-    from .stream.path import ViewPath
 
-    along = None if path is None else path_views(ViewPath.read(path), fps)
+    along = None if path is None else path_views(path, fps)
     if along is not None and len(along) > MOST_PICTURES:
         raise click.UsageError(f"{len(along):,} pictures are more than {MOST_PICTURES:,}: lower --fps")
 
@@ -280,4 +215,4 @@ class Waiting:
     def show(self, cut: Cut) -> None:
         """Tell one cut on the way."""
         if self._shown:
-            self._status.update(f"{cut.splats:,} samples here, {len(cut.wants):,} clouds wanted")
+            self._status.update(f"{counted(cut.splats, 'sample')} here, {counted(len(cut.wants), 'cloud')} wanted")

@@ -9,9 +9,11 @@ from typing import Any
 
 import click
 
+from lpc.info import counted
 from pointstream.cli import CACHE, choose_cache
 
-from .cli import TOLERANCE, SizeType, ViewType, Waiting, read_link
+from .arguments import TOLERANCE, SizeType, ViewType, read_link
+from .cli import Waiting
 
 
 @click.command()
@@ -48,9 +50,8 @@ def estimate(
     if as_json:
         click.echo(json.dumps(asdict(found), allow_nan=False))
         return
-    click.echo(
-        f"bytes           {found.bytes:,}, of which {found.cloud_bytes:,} in {found.clouds:,} clouds of the view"
-    )
+    clouds = counted(found.clouds, "cloud")
+    click.echo(f"bytes           {found.bytes:,}, of which {found.cloud_bytes:,} in {clouds} of the view")
     click.echo(f"splats          {found.splats:,} at a tolerance of {found.tolerance:g} px")
     time = "unknown: give --link" if found.seconds is None else f"{found.seconds:.1f} s"
     if found.rate is not None:

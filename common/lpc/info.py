@@ -1,4 +1,4 @@
-"""What `info` and `build` print of a model: the one mapping from a header to the contract's keys."""
+"""What `info` and `build` print of a model: the one mapping from a header to the contract's keys; and its words."""
 
 from __future__ import annotations
 
@@ -51,6 +51,11 @@ def info_dict(header: Header) -> dict[str, Any]:
         "generator": header.generator,
         "digest": header.digest,
     }
+
+
+def counted(number: int, noun: str) -> str:
+    """Write a number of things: ``1 cloud``, ``2,328 clouds``."""
+    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
 
 
 def largest_error(attribute: Attribute) -> float:

@@ -14,6 +14,9 @@ from lpc.context import ANCESTORS
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
+    import numpy as np
+    from numpy.typing import NDArray
+
     from lpc.cloud import Cloud
 
 OBJECT_BYTES = 1 << 10
@@ -50,14 +53,24 @@ class Ancestry:
         with self._lock:
             return {node: level[node] for node in nodes for level in self._levels.values() if node in level}
 
-    def keep(self, depth: int, found: Mapping[int, Ancestor]) -> None:
-        """Take in nodes of a level, and let go of levels that have no more descendants to tell."""
+    def keep(self, found: Mapping[int, Ancestor], depth: NDArray[np.int64], reached: int) -> None:
+        """Take in nodes, and let go of levels that have no more descendants to tell.
+
+        Parameters
+        ----------
+        found : mapping of int to Ancestor
+        depth : ndarray, (n,) int64
+            Levels of all nodes.
+        reached : int
+            Nodes of earlier levels have all been given out to be encoded.
+        """
         with self._lock:
-            for level in [level for level in self._levels if level < depth - ANCESTORS]:
-                self._bytes -= sum(map(_size, self._levels.pop(level).values()))
+            for done in [level for level in self._levels if level < reached - ANCESTORS]:
+                self._bytes -= sum(map(_size, self._levels.pop(done).values()))
             for node, ancestor in found.items():
-                if self._bytes + _size(ancestor) <= self._capacity:
-                    self._levels.setdefault(depth, {})[node] = ancestor
+                level = self._levels.setdefault(int(depth[node]), {})
+                if node not in level and self._bytes + _size(ancestor) <= self._capacity:
+                    level[node] = ancestor
                     self._bytes += _size(ancestor)
 
 

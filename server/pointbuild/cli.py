@@ -15,7 +15,7 @@ import click
 from rich.console import Console
 
 from lpc.errors import LpcError
-from lpc.info import info_dict
+from lpc.info import counted, info_dict
 
 from .build import BuildReport, build_model
 from .extend import read_header
@@ -106,7 +106,7 @@ def build(
         added = {} if append is None else {"clouds_kept": kept, "clouds_written": report.header.nodes - kept}
         click.echo(json.dumps(report_dict(report) | added))
     else:
-        click.echo(_sentence(report, out) + (f"; {report.clouds_kept:,} clouds kept" if append else ""))
+        click.echo(_sentence(report, out) + (f"; {counted(report.clouds_kept, 'cloud')} kept" if append else ""))
 
 
 def _tell(text: str) -> None:
@@ -126,10 +126,11 @@ def report_dict(report: BuildReport) -> dict[str, Any]:
 def _sentence(report: BuildReport, out: Path) -> str:
     header = report.header
     dropped = sum(header.rejected.values())
+    size = f"{counted(header.samples, 'sample')} in {counted(header.nodes, 'cloud')}, {counted(header.levels, 'level')}"
     return (
-        f"{out}: {header.samples:,} samples in {header.nodes:,} clouds, {header.levels} levels, {header.bytes:,} bytes "
+        f"{out}: {size}, {header.bytes:,} bytes "
         f"({header.bits_per_sample['total']:.1f} bits a sample), {report.seconds:.1f} s"
-        + (f"; {dropped:,} records without a position dropped" if dropped else "")
+        + (f"; {counted(dropped, 'record')} without a position dropped" if dropped else "")
     )
 
 

@@ -119,7 +119,7 @@ def encode_run(
     writer = CloudWriter(lattice, codes, bounds, schema, effort=effort)
     found = np.full(len(family), -1) if old is None else old.find(owner, bounds)
     clouds = _Clouds(writer, dict(zip(family.tolist(), found.tolist(), strict=True)), known)
-    frames, made, kept = [], {}, 0
+    frames, kept = [], 0
     for node in range(first, stop):
         line = line_of(node, nodes.parent) if generations else []
         if old and old.stays(clouds.old(node), [clouds.old(above) for above in line]):
@@ -128,8 +128,8 @@ def encode_run(
             continue
         frames.append(writer.frame(clouds.placed(node), [clouds.cloud(above) for above in line]))
         if generations and nodes.subtree[node] > nodes.samples[node]:
-            made[node] = Ancestor(clouds.cloud(node), clouds.old(node))
-    ancestry.keep(int(nodes.depth[first]), made)
+            clouds.cloud(node)
+    ancestry.keep(clouds.made, nodes.depth, int(nodes.depth[first]))
     before = len(family) - (stop - first)
     own = int(bounds[before])
     lattice, bounds = lattice[own:], bounds[before:] - own
@@ -171,6 +171,11 @@ class _Clouds:
         if node not in self._placed:
             self._placed[node] = self._writer.place(self._number[node])
         return self._placed[node]
+
+    @property
+    def made(self) -> dict[int, Ancestor]:
+        """All of these whose clouds were asked for."""
+        return {node: Ancestor(cloud, self.old(node)) for node, cloud in self._clouds.items()}
 
     def cloud(self, node: int) -> Cloud:
         """Cloud of a node, as it will be decoded."""

@@ -66,11 +66,6 @@ class Inputs:
             for scan in self.scans
         )
 
-    @property
-    def single(self) -> bool:
-        """All scans store positions as float32."""
-        return all(scan.info.single for scan in self.scans)
-
     def to_json(self) -> dict[str, Any]:
         """Give what is still of interest when the samples have been read."""
         dtypes = {name: dtype.str for name, dtype in self.attributes.items()}

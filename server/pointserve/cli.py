@@ -144,6 +144,10 @@ def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
 def sign(address: str, sign_key: Path, expires: int) -> None:
     """Print ADDRESS, a model or a folder (ends with a slash), with a signature that admits to it for a time."""
     try:
-        click.echo(sign_address(address, read_key(sign_key), int(time.time()) + expires))
+        key = read_key(sign_key)
     except LpcError as error:
         raise click.ClickException(str(error)) from error
+    try:
+        click.echo(sign_address(address, key, int(time.time()) + expires))
+    except LpcError as error:
+        raise click.BadParameter(str(error), param_hint="ADDRESS") from error

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
+import signal
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -20,6 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import surfaces
 from support.built import read_model
+from support.dying import DyingBuild, run_dying
 
 from lpc.errors import BuildError
 from lpc.header import parse_header
@@ -33,7 +32,6 @@ from pointbuild.folder import work_folder
 if TYPE_CHECKING:
     from pointbuild import BuildReport
 
-REPOSITORY = Path(__file__).resolve().parents[2]
 SURFACE = surfaces.bumpy(3000, seed=1, color=True)
 ON_BOX = ((SURFACE.xyz == SURFACE.xyz.min(axis=0)) | (SURFACE.xyz == SURFACE.xyz.max(axis=0))).any(axis=1)
 PATCH = (np.abs(SURFACE.xyz[:, 0] - 1) < 0.2) & (np.arange(3000) % 8 == 0) & ~ON_BOX
@@ -339,47 +337,6 @@ def test_options_that_make_no_sense(options: tuple[str, ...], why: str, files: t
     assert why in said.output
 
 
-# A child for each moment dies by SIGKILL at its n-th call of the system that may change a file (see test_resume).
-# Arguments: the scan, then a model and a moment (0: never) for each child.
-DYING = """
-import os, pathlib, signal, sys, time
-from pointbuild import BuildOptions, build_model
-from pointbuild import build
-
-calls = moment = 0
-
-def dying(function):
-    def call(*arguments, **named):
-        global calls
-        calls += 1
-        if calls == moment:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return function(*arguments, **named)
-    return call
-
-build.kernels_are_loaded = lambda: True
-for place, names in (
-    (os, ("pwrite", "truncate", "rename", "replace", "unlink", "fsync", "mkdir")),
-    (pathlib.Path, ("open", "rename", "replace", "unlink", "mkdir")),
-):
-    for name in names:
-        setattr(place, name, dying(getattr(place, name)))
-scan, rest = sys.argv[1], sys.argv[2:]
-for name, when in zip(rest[::2], rest[1::2]):
-    told, tell = os.pipe()
-    child = os.fork()
-    if not child:
-        moment = int(when)
-        model = pathlib.Path(name)
-        options = BuildOptions(bucket_samples=700, block_samples=900, threads=1)
-        build_model([scan], model, options, clock=time.monotonic, append=model)
-        os.write(tell, str(calls).encode())
-        os._exit(0)
-    os.close(tell)
-    print(os.waitpid(child, 0)[1], os.read(told, 99).decode() or "killed", flush=True)
-"""
-
-
 def test_killed_at_any_moment_the_old_model_is_whole_until_the_new_one_is(
     files: tuple[Path, Path], tmp_path: Path
 ) -> None:
@@ -390,29 +347,29 @@ def test_killed_at_any_moment_the_old_model_is_whole_until_the_new_one_is(
     built([first, second], whole)
     new = whole.read_bytes()
 
-    def run(*arguments: object) -> list[list[str]]:
-        paths = os.pathsep.join(str(REPOSITORY / part) for part in ("common", "server"))
-        done = subprocess.run(
-            [sys.executable, "-c", DYING, str(second), *map(str, arguments)],
-            env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True, check=True,
-        )  # fmt: skip
-        return [line.split() for line in done.stdout.splitlines()]
+    def run(models: list[Path], moments: list[int]) -> list[tuple[int, int]]:
+        small = {"bucket_samples": 700, "block_samples": 900, "threads": 1}
+        return run_dying(
+            [
+                DyingBuild(scan=str(second), out=str(each), options=small, moment=moment, append=True)
+                for each, moment in zip(models, moments, strict=True)
+            ]
+        )
 
-    ((status, count),) = run(model, 0)
-    assert (status, model.read_bytes()) == ("0", new)
-    last = int(count)
+    ((status, last),) = run([model], [0])
+    assert (status, model.read_bytes()) == (0, new)
     # The last call looks how much memory was used, when all is done and nothing is left that could tell.
     moments = [*range(2, last - 6, last // 6), *range(last - 6, last)]
     models = [tmp_path / str(moment) / "m.lpc" for moment in moments]
     for each in models:
         each.parent.mkdir()
         each.write_bytes(old)
-    killed = run(*(value for pair in zip(models, moments, strict=True) for value in pair))
-    assert {status for status, _ in killed} == {"9"}
+    killed = run(models, moments)
+    assert {status for status, _ in killed} == {signal.SIGKILL}
     found = [each.read_bytes() for each in models]
     assert {old, new} == set(found)
-    again = run(*(value for each in models for value in (each, 0)))
-    assert {status for status, _ in again} == {"0"}
+    again = run(models, [0] * len(models))
+    assert {status for status, _ in again} == {0}
     for each in models:
         assert each.read_bytes() == new, each
         assert list(each.parent.iterdir()) == [each]

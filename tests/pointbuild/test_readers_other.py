@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -25,6 +27,14 @@ def arrays(count=50):
         "intensity": rng.integers(0, 999, count).astype("u2"),
         "gps_time": rng.normal(size=count),
     }
+
+
+@pytest.mark.parametrize("as_path", [str, Path])
+@pytest.mark.parametrize("address", ["http://host/a%20b/scan.ply?x=1", "https://host/scan.laz", "s3://bucket/scan.e57"])
+def test_an_address_is_no_file_and_is_said_as_it_was_given(address, as_path):
+    with pytest.raises(ScanError, match="scans are read from files; fetch it first") as told:
+        open_scan(as_path(address))
+    assert str(told.value).startswith(f"{address}: ")
 
 
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from oracles import surfaces
+from support.dying import DyingBuild, run_dying
 
 import pointbuild.build
 import pointbuild.divide
@@ -25,59 +23,7 @@ from pointbuild import BuildOptions, build_model
 from pointbuild import folder as folder_module
 from pointbuild.journal import Journal, as_array, from_array
 
-REPOSITORY = Path(__file__).resolve().parents[2]
 MOMENTS = 20
-
-# Children die by SIGKILL at their n-th call of the system that may change a file, whichever thread makes it. So moments
-# are spread over the whole build, and the same in every run of one thread. Arguments: the scan, then a folder, a
-# moment (0: never) and a number of threads for each child; one line for each says how it ended and how many calls
-# it had made.
-DYING_BUILDS = """
-import os, pathlib, signal, sys, time
-from pointbuild import BuildOptions, build_model
-from pointbuild import build
-
-calls = moment = 0
-
-def dying(function):
-    def call(*arguments, **named):
-        global calls
-        calls += 1
-        if calls == moment:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return function(*arguments, **named)
-    return call
-
-build.kernels_are_loaded = lambda: True  # no small build before: its calls would be counted
-for place, names in (
-    (os, ("pwrite", "truncate", "rename", "replace", "unlink", "fsync", "mkdir")),
-    (pathlib.Path, ("open", "rename", "replace", "unlink", "mkdir")),
-):
-    for name in names:
-        setattr(place, name, dying(getattr(place, name)))
-scan, rest = sys.argv[1], sys.argv[2:]
-for folder, when, threads in zip(rest[::3], rest[1::3], rest[2::3]):
-    told, tell = os.pipe()
-    child = os.fork()
-    if not child:
-        moment = int(when)
-        options = BuildOptions(cloud_size=64, bucket_samples=700, block_samples=900, threads=int(threads))
-        build_model([scan], pathlib.Path(folder, "m.lpc"), options, clock=time.monotonic)
-        os.write(tell, str(calls).encode())
-        os._exit(0)
-    os.close(tell)
-    print(os.waitpid(child, 0)[1], os.read(told, 99).decode() or "killed", flush=True)
-"""
-
-
-def run(scan: Path, *arguments: object) -> list[list[str]]:
-    """Exit status and number of calls of each child."""
-    paths = os.pathsep.join(str(REPOSITORY / part) for part in ("common", "server"))
-    done = subprocess.run(
-        [sys.executable, "-c", DYING_BUILDS, str(scan), *map(str, arguments)],
-        env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    return [line.split() for line in done.stdout.splitlines()]
 
 
 def digest(path: Path) -> str:
@@ -96,8 +42,15 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+SMALL = {"cloud_size": 64, "bucket_samples": 700, "block_samples": 900}
+
+
 def options(threads: int = 1) -> BuildOptions:
-    return BuildOptions(cloud_size=64, bucket_samples=700, block_samples=900, threads=threads)
+    return BuildOptions(**SMALL, threads=threads)
+
+
+def run(scan: Path, folder: Path, moment: int, threads: int) -> DyingBuild:
+    return DyingBuild(scan=str(scan), out=str(folder / "m.lpc"), options={**SMALL, "threads": threads}, moment=moment)
 
 
 @pytest.fixture(scope="module")
@@ -109,10 +62,9 @@ def undisturbed(scan: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 def test_killed_at_twenty_moments(scan: Path, undisturbed: str, tmp_path: Path) -> None:
-    ((status, count),) = run(scan, tmp_path, 0, 1)
-    assert status == "0"
+    ((status, calls),) = run_dying([run(scan, tmp_path, 0, 1)])
+    assert status == 0
     assert digest(tmp_path / "m.lpc") == undisturbed
-    calls = int(count)
     assert calls > 100
     moments = sorted(np.random.default_rng(5).choice(np.arange(1, calls + 1), MOMENTS, replace=False).tolist())
     folders = [tmp_path / str(moment) for moment in moments]
@@ -120,8 +72,8 @@ def test_killed_at_twenty_moments(scan: Path, undisturbed: str, tmp_path: Path) 
         folder.mkdir()
         (folder / "m.lpc").write_bytes(b"an older model")
     threads = [1 + number % 2 for number in range(MOMENTS)]
-    ends = run(scan, *(part for entry in zip(folders, moments, threads, strict=True) for part in entry))
-    assert ends == [[str(int(signal.SIGKILL)), "killed"]] * MOMENTS
+    ends = run_dying([run(scan, *entry) for entry in zip(folders, moments, threads, strict=True)])
+    assert ends == [(signal.SIGKILL, 0)] * MOMENTS
     resumed = 0
     for folder, moment, count in zip(folders, moments, threads, strict=True):
         out = folder / "m.lpc"

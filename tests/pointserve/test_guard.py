@@ -21,6 +21,7 @@ from lpc.errors import StoreError
 from pointserve.cli import sign
 from pointserve.guard import Guard, read_key, read_tokens, sign_address
 from pointserve.paths import is_plain_name, url_path
+from pointstream import command
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -148,7 +149,7 @@ def test_secrets_from_files(tmp_path: Path) -> None:
         read_key(tmp_path / "nowhere")
 
 
-def test_sign_prints_an_address_that_the_server_admits(tmp_path: Path) -> None:
+def test_sign_prints_an_address_that_the_server_admits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "key").write_bytes(KEY)
     arguments = ["--sign-key", str(tmp_path / "key")]
     result = CliRunner().invoke(sign, ["https://host/a folder/david's.lpc", *arguments, "--expires", "30m"])
@@ -160,7 +161,9 @@ def test_sign_prints_an_address_that_the_server_admits(tmp_path: Path) -> None:
     assert admitted(target, now=expires - 1800)
     assert not admitted(target, now=expires)
     for wrong in ("ftp://host/x.lpc", "https://host/x.png", "https://host/a/../x.lpc", "host/x.lpc"):
-        result = CliRunner().invoke(sign, [wrong, *arguments])
-        assert (result.exit_code, result.output.count("\n")) == (1, 1)
+        assert command.run(["sign", wrong, *arguments]) == 2, "the arguments are wrong"
+        said = capsys.readouterr()
+        assert (said.out, said.err.count("\n")) == ("", 1)
+    assert command.run(["sign", "https://host/x.lpc", "--sign-key", str(tmp_path / "absent")]) == 1
     for wrong in ("7", "0d", "-1d", "d", "1y"):
         assert CliRunner().invoke(sign, ["https://host/x.lpc", *arguments, "--expires", wrong]).exit_code == 2

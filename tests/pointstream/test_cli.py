@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from oracles.build import build_bytes
 from support.servers import serve_in_thread
 
 import pointstream
+from lpc.points import PointBatch
 from pointstream import command
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-    from lpc.points import PointBatch
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +45,12 @@ def test_info_for_people_names_what_counts(path: Path, capsys: pytest.CaptureFix
     assert status == 0
     assert "20,000 in" in out
     assert "normal, color, intensity" in out
+
+
+def test_one_thing_is_not_told_as_many(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "one.lpc").write_bytes(build_bytes(PointBatch(np.arange(24.0).reshape(8, 3), {})))
+    assert "8 in 1 cloud of at most" in run(capsys, "info", tmp_path / "one.lpc")[1]
+    assert "1 of 1 cloud checked" in run(capsys, "verify", tmp_path / "one.lpc")[1]
 
 
 @pytest.mark.parametrize(

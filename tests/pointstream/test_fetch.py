@@ -8,23 +8,29 @@ import os
 import signal
 import subprocess
 import sys
+import time
+from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from support.frames import subtrees, whole_index
 from support.hosts import origin_of, virtual_store
 from support.servers import REPOSITORY, serve_in_thread
 
 import pointstream
 from lpc.errors import LpcError, StoreError, Unavailable
-from lpc.header import parse_header
+from lpc.header import HEADER_PROBE, parse_header
+from lpc.page import page_bytes
 from pointlink import virtual
 from pointlink.faults import Flip, Reset
 from pointlink.profiles import ADSL
 from pointstream import command
 from pointstream.fetch import FetchOptions, FetchReport, copy_name, fetch
-from pointstream.reading import Region
-from pointstream.stores.sparse import map_path
+from pointstream.reading import Reader, Region
+from pointstream.stores import open_store
+from pointstream.stores.sparse import SparseFile, map_path
+from pointstream.verify import VerifyReport, verify
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -39,6 +45,17 @@ def copy(origin: Origin, out: Path, **options: Any) -> FetchReport:
             return await fetch(store, out, FetchOptions(**options))
 
     return virtual.run(main())
+
+
+def verified(path: Path) -> VerifyReport:
+    async def main() -> VerifyReport:
+        store = open_store(str(path), clock=time.monotonic)
+        try:
+            return await verify(await Reader.open(store))
+        finally:
+            await store.close()
+
+    return asyncio.run(main())
 
 
 def asked(origin: Origin) -> int:
@@ -89,6 +106,48 @@ def test_a_budget_keeps_the_coarsest(model: bytes, tmp_path: Path) -> None:
         assert len(part.read()) < len(whole.read())
 
 
+@pytest.mark.parametrize("bounds", [None, (499_990.0, 3_999_990.0, 110.0, 500_000.0, 4_000_000.0, 121.0)])
+def test_a_copy_never_holds_more_than_was_asked_for(model: bytes, tmp_path: Path, bounds: Any) -> None:
+    """Whatever brought it: the first request brings clouds too, and ones outside the bounds."""
+    header, out = parse_header(model), tmp_path / "part.lpc"
+    whole = copy(origin_of(model), tmp_path / "all.lpc", region=Region(bounds=bounds)).bytes
+    least = header.page0 + page_bytes(header, 0)
+    for most in (least, 12_000, 40_000, 70_000, 90_000, 120_000):  # each goes on with the copy of the one before
+        report = copy(origin_of(model), out, most_bytes=most, region=Region(bounds=bounds))
+        assert min(most - 7_000, whole) <= report.bytes <= most
+        with closing(SparseFile(out, length=len(model), tag=header.tag, writable=False)) as file:
+            assert file.present.total == report.bytes
+        with pointstream.open(str(out)) as part:
+            assert part.info["here"]["clouds"] == report.clouds
+    assert copy(origin_of(model), out, most_bytes=12_000).bytes == report.bytes, "what is there stays"
+    with pytest.raises(StoreError, match=f"header and first page alone take {least:,}"):
+        copy(origin_of(model), tmp_path / "none.lpc", most_bytes=least - 1)
+
+
+def test_a_budget_reads_no_more_of_the_index_than_it_can_use(model: bytes, tmp_path: Path) -> None:
+    origin = origin_of(model)
+    copy(origin, tmp_path / "part.lpc", most_bytes=10_000)
+    assert asked(origin) <= HEADER_PROBE
+
+
+@pytest.mark.parametrize("share", [0.01, 0.02, 0.4, 0.9])
+def test_of_a_file_that_is_cut_short_all_is_copied_and_it_is_said(
+    share: float, model: bytes, tmp_path: Path, capsys: Any
+) -> None:
+    cut_short = tmp_path / "model.lpc"
+    cut_short.write_bytes(model[: int(share * len(model))])
+    assert command.run(["fetch", str(cut_short), str(tmp_path / "copy"), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["cut_short"], report["complete"]) == (True, False)
+    with pointstream.open(str(cut_short)) as here, pointstream.open(str(tmp_path / "copy" / "model.lpc")) as there:
+        assert here.info == there.info
+        assert report["clouds"] == here.info["here"]["clouds"]
+    assert command.run(["fetch", str(cut_short), str(tmp_path / "copy")]) == 0
+    assert (
+        f"{report['clouds']} of {report['clouds_total']} clouds of a file that is cut short" in capsys.readouterr().out
+    )
+
+
 def test_an_interruption_costs_only_what_was_on_its_way(large_model: bytes, tmp_path: Path) -> None:
     out, first = tmp_path / "model.lpc", origin_of(large_model)
 
@@ -134,6 +193,22 @@ def test_a_cloud_damaged_at_its_origin_is_told_and_left_out(model: bytes, tmp_pa
     assert report.clouds == report.clouds_total - 1
     with pointstream.open(str(out)) as part:
         assert len(part.read()) < part.header.samples
+
+
+def test_what_a_damaged_cloud_tells_is_copied_and_neither_read_nor_taken_for_damaged(
+    model: bytes, tmp_path: Path
+) -> None:
+    out, index, damaged = tmp_path / "model.lpc", whole_index(model), bytearray(model)
+    damaged[index.offset[2] + 15] ^= 2
+    report = copy(origin_of(bytes(damaged)), out)
+    assert [text.split(":")[0] for text in report.problems] == ["cloud 2"]
+    assert report.clouds == report.clouds_total - 1
+    untold = subtrees(index, [2])
+    with pointstream.open(str(out)) as part:
+        assert len(part.read()) == part.header.samples - int(index.samples[untold].sum())
+    copied = verified(out)
+    assert copied.clouds_checked == report.clouds
+    assert f"{len(untold) - 1} sound clouds of " in copied.problems[1]
 
 
 @pytest.mark.parametrize("there", ["other build", "foreign", "folder"])
@@ -239,3 +314,14 @@ def test_render_and_export_work_from_the_cache_with_the_host_gone(model: bytes, 
     with np.load(tmp_path / "a.npz") as one, np.load(tmp_path / "b.npz") as other:
         assert (one["xyz"] == other["xyz"]).all()
     assert command.run(["export", "--cache", "none", address, str(tmp_path / "c.npz")]) == 1
+
+
+def test_a_copy_that_has_no_page_yet_is_a_model_without_samples(model: bytes, tmp_path: Path, capsys: Any) -> None:
+    (tmp_path / "model.lpc").write_bytes(model[: parse_header(model).page0 + 100])
+    assert command.run(["fetch", str(tmp_path / "model.lpc"), str(tmp_path / "copy")]) == 0
+    out = str(tmp_path / "copy" / "model.lpc")
+    capsys.readouterr()
+    assert command.run(["info", out, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["here"] == {"samples": 0, "clouds": 0}
+    assert command.run(["render", out, str(tmp_path / "a.png"), "--size", "32x32", "--backend", "cpu"]) == 0
+    assert command.run(["export", out, str(tmp_path / "a.ply")]) == 0

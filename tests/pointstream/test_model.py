@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import threading
+import time
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import shells
 from support.frames import decoded_clouds, whole_index
 from support.servers import serve_in_thread
 
@@ -18,6 +20,8 @@ from lpc.errors import Corrupt, ModelChanged, NotFound, StoreError
 from lpc.header import parse_header
 from lpc.index import IndexTree
 from lpc.points import PointBatch
+from pointbuild import BuildOptions, build_model
+from pointbuild.arrays import ArrayScan
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -77,6 +81,22 @@ def test_spacing_refines_what_is_too_coarse(
         if above in wanted and index.spacing[above] > spacing:
             wanted.append(node)
     same(opened.read(spacing=spacing), PointBatch.concatenate(parts[n] for n in wanted))
+
+
+def test_spacing_is_that_of_the_sparse_half_too(tmp_path: Path) -> None:
+    """As refinement for the screen has it: an uneven cell is as coarse as the root of its mean square over the area."""
+    points = shells.sample(shells.TORUS, "halves", 30_000, normals=False)
+    options = BuildOptions(threads=1, cloud_size=128)
+    build_model([ArrayScan(points)], tmp_path / "halves.lpc", options, clock=time.monotonic)
+    with pointstream.open(str(tmp_path / "halves.lpc")) as model:
+        spacing = 8 * model.header.spacing
+        count = model.count(spacing=spacing)
+        assert len(model.read(spacing=spacing)) == count, "what was counted is what is read"
+        index = model.index
+        deeper = index.known & (index.density.coarseness > spacing)
+        assert (index.spacing[deeper] <= spacing).any(), "there is a cell that only unevenness makes too coarse"
+        read = {0} | set(index.children[deeper].ravel().tolist()) - {-1}
+        assert count == index.samples[sorted(read)].sum()
 
 
 @settings(max_examples=15, deadline=None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 import zlib
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,8 @@ from lpc.index import IndexTree
 from lpc.lattice import quantise
 from lpc.page import RECORD, pack_pages
 from lpc.points import PointBatch
+from pointbuild import BuildOptions, build_model
+from pointbuild.arrays import ArrayScan
 from pointstream.matching import Matcher
 from pointstream.reading import Reader
 from pointstream.stores import MemoryStore
@@ -135,6 +138,36 @@ def test_attributes_that_the_scan_lacks_are_not_compared(model: bytes, scan: Poi
     assert report.to_json()["max_normal_error_degrees"] is None
 
 
+def test_every_attribute_that_both_have_is_compared_and_the_others_are_named(scan: PointBatch, tmp_path: Path) -> None:
+    """Scalars of any name and type, and those that the header holds because they have one value everywhere."""
+    n = len(scan)
+    values = {
+        **scan.attributes,
+        "gps_time": np.random.default_rng(3).uniform(0, 1e9, n),
+        "source": np.full(n, 7, np.uint16),
+        "only_here": np.arange(n, dtype=np.int32),
+        "widened": np.arange(n, dtype=np.int32),
+    }
+    scans, options = [ArrayScan(PointBatch(scan.xyz, values))], BuildOptions(threads=1, attributes=("all",))
+    build_model(scans, tmp_path / "m.lpc", options, clock=time.monotonic)
+    data = (tmp_path / "m.lpc").read_bytes()
+    assert "source" in parse_header(data).constants
+    values.pop("only_here")
+    values["widened"] = values["widened"].astype(np.int64)
+    report = check(data, PointBatch(scan.xyz, values))
+    assert report.ok, report.problems
+    entry = report.to_json()
+    assert entry["attributes_differing"] == dict.fromkeys(["normal", "color", "intensity", "gps_time", "source"], 0)
+    assert entry["not_compared"] == {
+        "only_here": "not in the scans",
+        "widened": "int32 in the model, int64 in the scans",
+    }
+    for name, wrong in (("gps_time", np.nextafter(values["gps_time"], 0)), ("source", values["source"] + 1)):
+        changed = np.where(np.arange(n) % 100 == 5, wrong, values[name]).astype(values[name].dtype)
+        report = check(data, PointBatch(scan.xyz, {**values, name: changed}))
+        assert report.problems == (f"{name} differs in {n // 100} samples",)
+
+
 def test_another_scan_shares_nothing(model: bytes, scan: PointBatch) -> None:
     report = check(model, PointBatch(scan.xyz * 1e30, scan.attributes))
     assert report.match is not None
@@ -154,12 +187,16 @@ def test_a_cut_file_says_how_much_is_missing(length: int, model: bytes) -> None:
 def test_every_damaged_cloud_is_named(model: bytes) -> None:
     index = whole_index(model)
     damaged = bytearray(model)
-    for node in (2, 11):
+    below = int(index.children[int(index.children[2, 1]), 0])  # what a damaged cloud tells is checked, too
+    bad = [2, 11, below]
+    for node in bad:
         damaged[index.offset[node] + 15] ^= 2
     report = check(bytes(damaged))
-    assert [text.split(":")[0] for text in report.problems[:2]] == ["cloud 2", "cloud 11"]
-    assert report.problems[2].startswith(f"{len(subtrees(index, [2, 11])) - 2} sound clouds cannot be decoded")
-    assert "the header says 20000" in report.problems[3]
+    assert [text.split(":")[0] for text in report.problems[:3]] == [f"cloud {node}" for node in sorted(bad)]
+    untold = np.setdiff1d(subtrees(index, bad), bad)
+    samples = int(index.samples[untold].sum())
+    assert report.problems[3].startswith(f"{len(untold)} sound clouds of {samples:,} samples cannot be decoded")
+    assert "the header says 20000" in report.problems[4]
 
 
 def test_a_damaged_page_hides_its_clouds_and_the_rest_is_checked(model: bytes) -> None:
@@ -173,7 +210,7 @@ def test_a_damaged_page_hides_its_clouds_and_the_rest_is_checked(model: bytes) -
     report = check(bytes(damaged))
     assert report.clouds_checked == (header.pages - 1) * header.page_nodes
     assert f"page {header.pages - 1}" in report.problems[0]
-    assert "1 damaged pages hide" in report.problems[1]
+    assert "cannot be found behind 1 damaged page" in report.problems[1]
 
 
 def test_lies_under_right_checksums_are_found(model: bytes) -> None:

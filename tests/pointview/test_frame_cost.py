@@ -25,17 +25,17 @@ def model():
     return models.sphere(6000, cloud_size=16)
 
 
-@pytest.fixture(params=["cpu", "gl"])
+@pytest.fixture(params=["cpu", "gl", "gl 3.3"])
 def backend(request, model):
     if request.param == "cpu":
         opened = CpuBackend(model.header)
     else:
         gl = pytest.importorskip("pointview.render.gl")
         try:
-            opened = gl.GlBackend(model.header)
+            opened = gl.GlBackend(model.header, indirect=request.param == "gl")
         except Unavailable as error:
             pytest.skip(str(error))
-        if not opened._one_draw:
+        if request.param == "gl" and not opened._indirect:
             opened.close()
             pytest.skip("no OpenGL 4.3")
     yield opened
@@ -51,7 +51,7 @@ def cut_of(model, nodes):
 
 
 def calls(work):
-    """Calls of Python and of C functions that some work makes, a garbage collection's callbacks and finalizers apart."""
+    """Calls of Python and of C functions of some work, a garbage collection's callbacks and finalizers apart."""
     count = 0
 
     def seen(frame, event, argument):
@@ -96,7 +96,7 @@ def test_an_arena_keeps_its_size_and_the_cut_in_it(model):
     except Unavailable as error:
         pytest.skip(str(error))
     try:
-        size = backend._vertex.size, backend._color.size
+        size = backend._memory.size
         whole = refine(model.index, CAMERA, 1e-3, model.everything, cull_backfaces=False).nodes
         rng = np.random.default_rng(0)
         for _ in range(30):
@@ -106,7 +106,7 @@ def test_an_arena_keeps_its_size_and_the_cut_in_it(model):
             assert (backend._arena.slots_of(some) >= 0).all()  # nothing of the cut gave way to another of it
             again = backend.draw(chosen, model.take, CAMERA, STYLE)
             assert (frame.uploads <= 150, again.uploads) == (True, 0)
-        assert (backend._vertex.size, backend._color.size) == size
+        assert (backend._memory.size) == size
         assert len(backend._arena.count) == 200
     finally:
         backend.close()

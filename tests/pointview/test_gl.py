@@ -80,12 +80,12 @@ def assert_same(frame, oracle, share=SHARE, *, ties=False):
     assert (frame.splats, frame.clouds) == (oracle.splats, oracle.clouds)
 
 
-@pytest.mark.parametrize("one_draw", [True, False])
+@pytest.mark.parametrize("indirect", [True, False])
 @pytest.mark.parametrize("two_sided", [True, False])
-def test_the_cpu_picture(gl, scene, one_draw, two_sided):
+def test_the_cpu_picture(gl, scene, indirect, two_sided):
     model, camera = scene
     style = Style(two_sided=two_sided, background=(30, 60, 90))
-    backend, oracle = gl(model.header, one_draw=one_draw), CpuBackend(model.header)
+    backend, oracle = gl(model.header, indirect=indirect), CpuBackend(model.header)
     for tolerance, resident in (
         (1.0, model.everything),
         (6.0, model.everything),
@@ -109,10 +109,10 @@ def test_other_splats(gl, scene, splat):
     backend.close()
 
 
-@pytest.mark.parametrize("one_draw", [True, False])
-def test_blended_pictures(gl, scene, one_draw):
+@pytest.mark.parametrize("indirect", [True, False])
+def test_blended_pictures(gl, scene, indirect):
     model, camera = scene
-    backend, oracle = gl(model.header, one_draw=one_draw), CpuBackend(model.header)
+    backend, oracle = gl(model.header, indirect=indirect), CpuBackend(model.header)
     for tolerance, resident, two_sided in (
         (1.0, model.everything, False),
         (6.0, model.everything, True),
@@ -154,6 +154,42 @@ def test_a_small_arena_gives_the_same_picture_in_several_passes(gl):
     assert (blended[0] != expected.rgb).any()
     np.testing.assert_array_equal(*blended)
     small.close()
+    large.close()
+
+
+class Narrow:
+    """A context that allows textures of so many texels a side."""
+
+    def __init__(self, context, most):
+        self._context, self.info = context, {**context.info, "GL_MAX_TEXTURE_SIZE": most}
+
+    def __getattr__(self, name):
+        return getattr(self._context, name)
+
+    def __enter__(self):
+        return self._context.__enter__()
+
+    def __exit__(self, *error):
+        return self._context.__exit__(*error)
+
+
+@pytest.mark.parametrize("most", [600, 100])
+def test_clouds_in_small_textures_give_the_same_picture(gl, monkeypatch, most):
+    from pointview.render import gl as module
+
+    model, make = models.torus(8000), module._context
+    camera = Camera(eye=(1, -2.5, 2), target=(0, 0, 0), up=(0, 0, 1), width=161, height=120)
+    cut = refine(model.index, camera, 1.0, model.everything)
+    large = gl(model.header)
+    monkeypatch.setattr(module, "_context", lambda: Narrow(make(), most))
+    narrow = gl(model.header, indirect=False)
+    expected = large.draw(cut, model.take, camera, Style())
+    assert (narrow._arena.slots < len(cut.nodes)) == (most == 100)  # 100: a cloud takes three rows
+    for _ in range(2):
+        frame = narrow.draw(cut, model.take, camera, Style())
+        np.testing.assert_array_equal(frame.rgb, expected.rgb)
+        np.testing.assert_array_equal(frame.node, expected.node)
+    narrow.close()
     large.close()
 
 

@@ -147,7 +147,7 @@ def test_any_prefix_is_a_picture(model_file, tmp_path, share):
     ("view", "why"),
     [
         ("{", "not JSON"),
-        ("[1, 2]", "no view"),
+        ("[1, 2]", "not a JSON object"),
         ("{}", "eye"),
         ('{"eye": [0, 0, 1], "target": [0, 0, 1], "up": [0, 1, 0], "fov_y": 45}', "same point"),
         ('{"eye": [0, 0, NaN], "target": [0, 0, 1], "up": [0, 1, 0], "fov_y": 45}', "finite"),
@@ -158,7 +158,7 @@ def test_a_wrong_view_is_one_line(model_file, tmp_path, capsys, view, why):
     path = tmp_path / "view.json"
     path.write_text(view)
     out = tmp_path / "a.png"
-    assert command(["render", str(model_file), str(out), "--view", str(path)]) == 1
+    assert command(["render", str(model_file), str(out), "--view", str(path)]) == 2
     said = capsys.readouterr()
     assert said.out == ""
     assert said.err.count("\n") == 1
@@ -171,6 +171,7 @@ def test_a_wrong_view_is_one_line(model_file, tmp_path, capsys, view, why):
     [
         ("--size", "0x5"), ("--size", "1024"), ("--size", "99999x2"), ("--tolerance", "0"), ("--tolerance", "-1"),
         ("--tolerance", "nan"), ("--budget", "0"), ("--backend", "metal"), ("--view", "absent.json"),
+        ("--path", "absent.json"), ("--fps", "5"), ("--animation", "gif"),
     ],
 )  # fmt: skip
 def test_wrong_arguments_exit_2(model_file, tmp_path, arguments):

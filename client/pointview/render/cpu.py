@@ -13,10 +13,11 @@ import numpy as np
 
 from pointview import splats
 
-from . import kernels, picture_kernels, rules, shading, splat_kernels, tables
+from . import kernels, picture_kernels, shading, splat_kernels, tables
 from .arena import Arena
 from .backend import Frame, Style, Take
 from .blending import blend, linear_light
+from .canvas import Canvas
 from .pack import Packer
 from .seen import place_table
 
@@ -49,7 +50,7 @@ class CpuBackend:
         self._arena = Arena(header.nodes, max(1, min(header.nodes, FIRST_SAMPLES // self._samples)))
         self._vertex = np.empty((self._arena.slots * self._samples, 4), dtype=np.uint16)
         self._color = np.empty((self._arena.slots * self._samples, 4), dtype=np.uint8)
-        self._layers = np.empty((self._threads, 0), dtype=np.uint64)
+        self._canvas: Canvas | None = None
 
     @property
     def name(self) -> str:
@@ -60,36 +61,34 @@ class CpuBackend:
         """Draw a cut."""
         uploads = self._upload(cut.nodes, take)
         shape = (camera.height, camera.width)
-        padded = splat_kernels.padded(*shape)
-        if self._layers.shape[1] != padded:
-            self._layers = np.empty((self._threads, padded), dtype=np.uint64)
+        canvas, self._canvas = self._canvas, None  # a frame that fails leaves none
+        if canvas is None or canvas.shape != shape:
+            canvas = Canvas(*shape, self._threads, splat_kernels.padded(*shape))
         words, colors = self._vertex.view(np.uint64).ravel(), self._color.view(np.uint32).ravel()
-        clouds, cloud_of_block = self._clouds(cut, camera)
+        clouds, cloud_of_block, row_of_block = self._clouds(cut, camera)
         places, halvings = place_table(cut)
         view = self._view(cut, camera, style)
         light = self._light(camera, style)
         rotation = camera.rotation().astype(np.float32)
-        rgb, depth = np.empty((*shape, 3), dtype=np.uint8), np.empty(shape, dtype=np.float32)
-        node, side = np.empty(shape, dtype=np.int32), np.empty(shape, dtype=np.float32)
-        starved = np.empty(shape, dtype=bool)
-        holes, sources = np.empty(depth.size, dtype=np.int32), np.empty(depth.size, dtype=np.int32)
+        rgb, depth = canvas.empty(np.uint8, 3), canvas.empty(np.float32)
+        node, starved = canvas.empty(np.int32), canvas.empty(bool)
+        side, holes, sources = canvas.side, canvas.holes, canvas.sources
         surface = (255, 255, 255) if self._packer.has_colors else style.surface
         albedo = np.array(surface, dtype=np.float32) / np.float32(255)
         background = np.array(style.background, dtype=np.uint8)
 
         def splat(worker: int) -> None:
-            self._layers[worker] = rules.EMPTY
             # Every `threads`-th cloud: neighbours in the array are neighbours in space, and cost alike.
             mine = np.ascontiguousarray(clouds[worker :: self._threads])
-            splat_kernels.splat(self._layers[worker], words, mine, places, halvings, rotation, view)
+            splat_kernels.splat(canvas.keys[worker], words, mine, places, halvings, rotation, view)
 
         def rows(worker: int) -> tuple[int, int]:
             return camera.height * worker // self._threads, camera.height * (worker + 1) // self._threads
 
-        def resolve(worker: int) -> None:
-            kernels.resolve(
-                self._layers, *rows(worker), rgb, depth, node, side, starved, words, colors, clouds,
-                cloud_of_block, places, halvings, rotation, view, light, albedo, background,
+        def resolve(worker: int) -> np.float32:
+            return kernels.resolve(
+                canvas.keys, *rows(worker), rgb, depth, node, side, starved, words, colors, clouds,
+                cloud_of_block, row_of_block, places, halvings, rotation, view, light, albedo, background,
             )  # fmt: skip
 
         def dim(worker: int) -> None:
@@ -97,7 +96,7 @@ class CpuBackend:
             picture_kernels.eye_dome(rgb, depth, side, *rows(worker), strength, shading.NEIGHBOUR, shading.DARKEST)
 
         def find(worker: int) -> slice:
-            largest = min(splats.LARGEST_HOLE, math.ceil(splats.HOLE * side.max()))
+            largest = min(splats.LARGEST_HOLE, math.ceil(splats.HOLE * widest))
             top, bottom = rows(worker)
             found = picture_kernels.close_holes(
                 depth, side, holes, sources, top, bottom, camera.focal, splats.HOLE, largest, splats.WALLS
@@ -105,7 +104,8 @@ class CpuBackend:
             return slice(top * camera.width, top * camera.width + found)
 
         self._in_parallel(splat)
-        self._in_parallel(resolve)
+        widest = max(self._in_parallel(resolve))
+        self._canvas = canvas
         if style.close_holes:
             found = self._in_parallel(find)
             into, out_of = (np.concatenate([pixels[part] for part in found]) for pixels in (holes, sources))
@@ -155,8 +155,8 @@ class CpuBackend:
             self._arena.put(slot, packed)
         return len(absent)
 
-    def _clouds(self, cut: Cut, camera: Camera) -> tuple[NDArray[Any], NDArray[np.int32]]:
-        """Return the clouds of the frame, and the cloud that each block of places belongs to."""
+    def _clouds(self, cut: Cut, camera: Camera) -> tuple[NDArray[Any], NDArray[np.int32], NDArray[np.int64]]:
+        """Return the clouds of the frame; the cloud of each block of places, and what to add there for a row."""
         slots = self._arena.slots_of(cut.nodes)
         blocks = (self._arena.count[slots] >> kernels.BLOCK_BITS) + 1
         clouds = np.empty(len(slots), dtype=tables.CLOUD)
@@ -173,7 +173,8 @@ class CpuBackend:
             clouds["level"] = cut.places.level
             corner = self._arena.origin[slots] - cut.places.corner
             clouds["corner_x"], clouds["corner_y"], clouds["corner_z"] = corner.T
-        return clouds, np.repeat(np.arange(len(slots), dtype=np.int32), blocks)
+        cloud_of_block = np.repeat(np.arange(len(slots), dtype=np.int32), blocks)
+        return clouds, cloud_of_block, (clouds["first"] - clouds["place"])[cloud_of_block]
 
     def _view(self, cut: Cut, camera: Camera, style: Style) -> Any:
         view = np.zeros(1, dtype=tables.VIEW)[0]

@@ -1,9 +1,7 @@
-"""The OpenGL backend: clouds stay quantised in GPU memory, and a frame is one indirect multi-draw.
+"""The OpenGL backend: clouds stay quantised in GPU memory, and a frame is one draw.
 
 Memory is an arena of equal slots, fixed when the backend is opened. A cut that is larger than the arena is drawn in
-several passes over the same depth buffer. From OpenGL 4.3 on all clouds of a pass are one
-`glMultiDrawArraysIndirect`: each command picks its cloud's parameters by its base instance. Below that, each cloud is
-a draw with uniforms of its own; same shader, same picture.
+several passes over the same depth buffer, each of which is one call of OpenGL (`gl_memory`).
 
 A GL context belongs to the thread that made it: open, draw and close on one thread.
 """
@@ -25,6 +23,7 @@ from . import shading
 from .arena import Arena
 from .backend import Frame, Style, Take
 from .blending import LEAST
+from .gl_memory import COMMANDS_FROM, PLACEMENT, Buffers, Memory, Textures
 from .pack import SAMPLE_BYTES, Packer
 
 if TYPE_CHECKING:
@@ -35,31 +34,11 @@ if TYPE_CHECKING:
     from pointview.refine import Cut
 
 ARENA_BYTES = 512 << 20
-COMMANDS_FROM = 430
-"""First version with multi-draw-indirect, 100 * major + 10 * minor."""
-
 EMPTY = float(np.finfo(np.float32).max)
 """Depth of a pixel without sample on the GPU, which need not know infinity."""
 
 PLACES_UNIT = 7
 """Texture unit; the passes over the picture use the first ones."""
-
-COMMAND = np.dtype([(name, "<u4") for name in ("count", "instances", "first", "base_instance", "padding")])
-"""glMultiDrawArraysIndirect's command, padded: moderngl steps 20 bytes from one to the next."""
-
-PLACEMENT = np.dtype(
-    [
-        ("offset", "<f4", 3),
-        ("scale", "<f4"),
-        ("corner", "<f4", 3),
-        ("side", "<f4"),
-        ("node", "<i4"),
-        ("row", "<i4"),
-        ("level", "<i4"),
-        ("padding", "<i4"),
-    ]
-)
-"""What a draw of one cloud is told; see the vertex shader."""
 
 STARVED = 1 << 30
 """Added to the row of a node that is starved everywhere."""
@@ -75,7 +54,7 @@ class GlBackend:
     ----------
     arena_bytes : int
         GPU memory for clouds.
-    one_draw : bool or None
+    indirect : bool or None
         Use the indirect multi-draw; None: where OpenGL has it.
 
     Raises
@@ -84,20 +63,20 @@ class GlBackend:
         If no OpenGL 3.3 context can be made.
     """
 
-    def __init__(self, header: Header, *, arena_bytes: int = ARENA_BYTES, one_draw: bool | None = None) -> None:
+    def __init__(self, header: Header, *, arena_bytes: int = ARENA_BYTES, indirect: bool | None = None) -> None:
         self._packer = Packer(header)
         self._samples = min(int(header.cloud_size), int(header.samples))
         self._context = _context()
         self.renderer = str(self._context.info["GL_RENDERER"])
         has_commands = self._context.version_code >= COMMANDS_FROM
-        self._one_draw = has_commands if one_draw is None else one_draw and has_commands
+        self._indirect = has_commands and indirect is not False
         slots = max(1, min(header.nodes, arena_bytes // (self._samples * SAMPLE_BYTES)))
-        self._arena = Arena(header.nodes, slots)
         try:
             self._build(slots)
         except moderngl.Error as error:
             self._context.release()
             raise Unavailable(f"OpenGL ({self.renderer}) failed: {_one_line(error)}; use --backend cpu") from error
+        self._arena = Arena(header.nodes, self._memory.slots)
         self._largest = min(splats.LARGEST, float(self._context.info["GL_POINT_SIZE_RANGE"][1]) / 1.5)
         self._margin = math.ceil(self._largest)
 
@@ -136,17 +115,12 @@ class GlBackend:
 
     def _build(self, slots: int) -> None:
         context = self._context
-        defines = "#define COMMANDS\n" if self._one_draw else ""
-        self._vertex = context.buffer(reserve=slots * self._samples * 8)
-        self._color = context.buffer(reserve=slots * self._samples * 4)
-        content: list[Any] = [(self._vertex, "4u2", "vertex"), (self._color, "4f1", "color")]
-        if self._one_draw:
-            self._placements = context.buffer(reserve=slots * PLACEMENT.itemsize)
-            self._commands = context.buffer(reserve=slots * COMMAND.itemsize)
-            content.append((self._placements, "4f 4f 4i /i", "cloud_origin", "cloud_corner", "cloud_numbers"))
+        kind = Buffers if self._indirect else Textures
+        self._memory: Memory = kind(context, slots, self._samples)
+        self._placements = np.zeros(slots, dtype=PLACEMENT)
         self._splats, self._kernels = (
-            _Samples(context, name, define, content)
-            for name, define in (("splat.frag.glsl", defines), ("blend.frag.glsl", f"{defines}#define BLENDED\n"))
+            _Samples(context, self._memory, name, define)
+            for name, define in (("splat.frag.glsl", ""), ("blend.frag.glsl", "#define BLENDED\n"))
         )
         self._closer, self._dimmer, self._mean = (
             context.program(vertex_shader=_shader("picture.vert.glsl"), fragment_shader=_shader(name))
@@ -224,8 +198,7 @@ class GlBackend:
             except BaseException:
                 self._arena.forget(absent[done:])
                 raise
-            self._vertex.write(packed.vertex, offset=slot * self._samples * 8)
-            self._color.write(packed.color, offset=slot * self._samples * 4)
+            self._memory.write(slot, packed)
             self._arena.put(slot, packed)
         return len(absent)
 
@@ -249,31 +222,17 @@ class GlBackend:
         """Draw nodes that are in the arena."""
         nodes = cut.nodes[part]
         slots = self._arena.slots_of(nodes)
-        counts = self._arena.count[slots]
-        placement = np.empty(len(nodes), dtype=PLACEMENT)
+        placement = self._placements[: len(nodes)]
         placement["offset"] = self._arena.origin[slots] - np.array(camera.eye)
         placement["scale"] = self._arena.scale[slots]
         placement["side"] = cut.spacing[part] * (splats.CLOSING * camera.focal)
-        placement["node"] = nodes
-        placement["row"] = np.arange(len(cut.nodes))[part] + np.where(cut.starved[part], STARVED, 0)
+        placement["node"], placement["count"] = nodes, self._arena.count[slots]
+        placement["row"] = np.arange(part.start, part.start + len(nodes)) + cut.starved[part] * STARVED
         placement["level"] = -1
         if cut.places is not None:
             placement["level"] = cut.places.level[part]
             placement["corner"] = self._arena.origin[slots] - cut.places.corner[part]
-        first = slots * self._samples
-        if self._one_draw:
-            commands = np.zeros(len(nodes), dtype=COMMAND)
-            commands["count"], commands["instances"], commands["first"] = counts, 1, first
-            commands["base_instance"] = np.arange(len(nodes))
-            self._placements.write(placement)
-            self._commands.write(commands)
-            samples.points.render_indirect(self._commands, moderngl.POINTS, len(nodes))
-            return
-        write, render, size = samples.program["cloud"].write, samples.points.render, PLACEMENT.itemsize
-        told = placement.tobytes()
-        for row, (count, start) in enumerate(zip(counts.tolist(), first.tolist(), strict=True)):
-            write(told[row * size : (row + 1) * size])
-            render(moderngl.POINTS, count, first=start)
+        self._memory.draw(samples.points, slots, placement)
 
     def _close_holes(self, layers: _Layers, camera: Camera) -> _Layers:
         self._closed.target.use()
@@ -359,10 +318,10 @@ class _Sums:
 class _Samples:
     """A pass over the samples of a cut."""
 
-    def __init__(self, context: Any, fragment: str, defines: str, content: list[Any]) -> None:
-        shaders = _shader("splat.vert.glsl", defines), _shader(fragment, defines)
+    def __init__(self, context: Any, memory: Memory, fragment: str, defines: str) -> None:
+        shaders = _shader("splat.vert.glsl", memory.defines + defines), _shader(fragment, defines)
         self.program = context.program(vertex_shader=shaders[0], fragment_shader=shaders[1])
-        self.points = context.vertex_array(self.program, content)
+        self.points = memory.points(self.program)
 
     def tell(self, values: dict[str, Any]) -> None:
         """Set the uniforms that this pass has."""

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 BLOCK_BITS = 8
 """Places are given out in blocks of 256, so that a table of blocks finds the cloud of a place."""
 
+RUN = 32
+"""Pixels of which it is asked at a time whether they show anything."""
+
 MOST_SQUARINGS = 6
 """A highlight is no sharper than the 64th power."""
 
@@ -41,6 +44,7 @@ def resolve(
     colors: NDArray[np.uint32],
     clouds: NDArray[Any],
     cloud_of_block: NDArray[np.int32],
+    row_of_block: NDArray[np.int64],
     places: NDArray[Any],
     halvings: NDArray[Any],
     rotation: NDArray[np.float32],
@@ -48,10 +52,16 @@ def resolve(
     light: Any,
     albedo: NDArray[np.float32],
     background: NDArray[np.uint8],
-) -> None:  # pragma: no cover - compiled
+) -> np.float32:  # pragma: no cover - compiled
     """Colour, depth, node, side and starvation of the rows `top` to `bottom` from the key images (threads, padded).
 
-    A row at a time: the samples are gathered, which waits for memory, and then lit, which vector instructions do.
+    Leaves the key images empty, and the sides of pixels that show nothing as they were. A row at a time: the samples
+    are gathered, which waits for memory, and then lit, which vector instructions do.
+
+    Returns
+    -------
+    float32
+        Largest side.
     """
     width = rgb.shape[1]
     nearest, column_of = np.empty(width, dtype=np.uint64), np.empty(width, dtype=np.int32)
@@ -60,24 +70,15 @@ def resolve(
     code, color = np.empty(width, dtype=np.int32), np.empty(width, dtype=np.uint32)
     bright, shine = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
     here, across = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
+    blank, largest = np.empty((width, 3), dtype=np.uint8), F(0.0)
+    blank[:] = background
     for row in range(top, bottom):
-        for column in range(width):
-            key = layers[0, row * width + column]
-            for layer in range(1, len(layers)):
-                key = min(key, layers[layer, row * width + column])
-            nearest[column] = key
-            depth[row, column], node[row, column], side[row, column] = np.inf, -1, 0.0
-            starved[row, column] = False
-            for channel in range(3):
-                rgb[row, column, channel] = background[channel]
-        count = 0
-        for column in range(width):
-            column_of[count] = column
-            count += nearest[column] != EMPTY
+        rgb[row], depth[row], node[row], starved[row] = blank, np.inf, -1, False
+        count = _covered(nearest, column_of, layers, row * width)
         for k in range(count):  # nothing but loads, many at a time on their way
-            place = np.int64(nearest[column_of[k]] & np.uint64(0xFFFFFFFF))
-            which[k] = cloud_of_block[place >> BLOCK_BITS]
-            i = place + (clouds[which[k]].first - clouds[which[k]].place)
+            place = np.uint32(nearest[k])
+            block = place >> np.uint32(BLOCK_BITS)
+            which[k], i = cloud_of_block[block], row_of_block[block] + np.int64(place)
             word[k], color[k] = words[i], colors[i]
         for k in range(count):
             cloud = clouds[which[k]]
@@ -100,10 +101,37 @@ def resolve(
         for k in range(count):
             column = column_of[k]
             depth[row, column], side[row, column] = here[k], across[k]
+            largest = max(largest, across[k])
             for channel in range(3):
                 own = F((color[k] >> np.uint32(8 * channel)) & np.uint32(0xFF))
                 value = own * albedo[channel] * bright[k] + F(255.0) * shine[k]
                 rgb[row, column, channel] = np.uint8(min(value + F(0.5), F(255.0)))
+    return largest
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _covered(
+    nearest: NDArray[np.uint64], columns: NDArray[np.int32], layers: NDArray[np.uint64], start: int
+) -> int:  # pragma: no cover - compiled
+    """List the keys of a row of pixels, and their columns; return how many they are. Leaves the row empty."""
+    width, keys = len(nearest), layers[0, start:]
+    for layer in range(1, len(layers)):
+        others = layers[layer, start:]
+        for column in range(width):
+            keys[column] = min(keys[column], others[column])
+            others[column] = EMPTY
+    count = 0
+    for first in range(0, width, RUN):
+        end, least = min(first + RUN, width), EMPTY
+        for column in range(first, end):
+            least = min(least, keys[column])
+        if least == EMPTY:
+            continue
+        for column in range(first, end):
+            nearest[count], columns[count] = keys[column], column
+            count += keys[column] != EMPTY
+            keys[column] = EMPTY
+    return count
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 DIRECTIONS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1))
 """Of the eight neighbours; opposite ones first, which decide soonest."""
 
+BAND = 32
+"""Rows that are looked through for holes at a time: what is noted of them stays in the second cache."""
+
 F = np.float32
 
 
@@ -102,9 +105,16 @@ def close_holes(
     """
     height, width = depth.shape
     first = count = top * width
+    if largest == 0:
+        return 0
+    deep = np.empty((BAND, width), dtype=np.float32)
     for row in range(top, bottom):
+        if (row - top) % BAND == 0:
+            _between_walls(deep, depth, side, row, focal, largest)
         for column in range(width):
             here = depth[row, column]
+            if not deep[(row - top) % BAND, column] < here:
+                continue
             best, nearest, found = row * width + column, largest + 1, 0
             for direction in range(8):
                 if found + 8 - direction < walls:
@@ -128,6 +138,60 @@ def close_holes(
                 holes[count], sources[count] = row * width + column, best
                 count += 1
     return count - first
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _between_walls(
+    deep: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    side: NDArray[np.float32],
+    top: int,
+    focal: float,
+    reach: int,
+) -> None:  # pragma: no cover - compiled
+    """Write how deep the pixels of the rows from `top` must be to have walls within `reach` pixels around them.
+
+    To the left, to the right, above and below, but for one of these. What is no deeper is in no hole, and that is
+    nearly every pixel.
+    """
+    (rows, width), height, inf = deep.shape, len(depth), F(np.inf)
+    wide = width + 2 * reach
+    walls, spare = np.full((rows + 2 * reach) * wide, inf), np.empty((rows + 2 * reach) * wide, np.float32)
+    for row in range(max(top - reach, 0), min(top + rows + reach, height)):
+        start = (row - top + reach) * wide + reach
+        line, own_depth, own_side = walls[start : start + width], depth[row], side[row]
+        for column in range(width):
+            wall = own_depth[column]
+            line[column] = wall * (F(1.0) + own_side[column] / F(focal)) if wall < inf else inf
+    across = walls[reach * wide : (reach + rows) * wide].copy()
+    across = _least(across, spare[: len(across)], 1, reach).copy()
+    along = _least(walls, spare, wide, reach)
+    for row in range(rows):
+        left, right = across[row * wide :], across[row * wide + reach + 1 :]
+        above, below = along[row * wide + reach :], along[(row + reach + 1) * wide + reach :]
+        line = deep[row]
+        for column in range(width):
+            level = max(left[column], right[column]), min(left[column], right[column])
+            upright = max(above[column], below[column]), min(above[column], below[column])
+            line[column] = max(min(level[0], upright[0]), max(level[1], upright[1]))
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _least(
+    values: NDArray[np.float32], spare: NDArray[np.float32], stride: int, window: int
+) -> NDArray[np.float32]:  # pragma: no cover - compiled
+    """Return the least of so many values from each on, `stride` apart: from those of half as many, and so on.
+
+    Where these go beyond the end, what is returned means nothing. Both arrays are written.
+    """
+    done = 1
+    while done < window:
+        more = min(done, window - done)
+        ahead = values[more * stride :]
+        for i in range(len(ahead)):
+            spare[i] = min(values[i], ahead[i])
+        values, spare, done = spare, values, done + more
+    return values
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from pointstream.arguments import Number
-from pointview.cli import TOLERANCE, SizeType, ViewType, read_link
+from pointview.arguments import TOLERANCE, PathType, SizeType, ViewType, read_link
+
+if TYPE_CHECKING:
+    from .path import ViewPath
 
 LONGEST = 3600.0
 """Seconds: a run keeps two pictures a second in memory."""
@@ -28,7 +31,7 @@ LONGEST = 3600.0
 )
 @click.option("--report", required=True, type=click.Path(path_type=Path, file_okay=False), help="Folder to write to.")
 @click.option("--view", type=ViewType(), help="Where to look from; without it the whole model is framed.")
-@click.option("--path", type=click.Path(path_type=Path, dir_okay=False), help="PATH.json: views at times.")
+@click.option("--path", type=PathType(), help="PATH.json: views at times.")
 @click.option("--clock", default="real", show_default=True, type=click.Choice(["real", "virtual"]))
 @click.option("--size", type=SizeType(), default="1024x768", show_default=True, help="Picture size in pixels.")
 @TOLERANCE
@@ -67,7 +70,7 @@ def stream(
     seconds: float,
     report: Path,
     view: dict[str, Any] | None,
-    path: Path | None,
+    path: ViewPath | None,
     clock: str,
     size: tuple[int, int],
     tolerance: float,
@@ -87,11 +90,7 @@ def stream(
     if view is not None and path is not None:
         raise click.UsageError("--view and --path exclude each other")
     profile = read_link(link)
-    views = None
-    if path is not None:
-        views = ViewPath.read(path)
-    elif view is not None:
-        views = ViewPath.still(view)
+    views = path if view is None else ViewPath.still(view)
     experiment = Experiment(
         model=model,
         link=link,

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lpc.errors import LpcError, Unavailable
+from lpc.info import counted
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -59,7 +60,7 @@ def tour(folder: Path, *, scan: Path | None, seconds: float, link: str) -> Itera
     yield from _announce("build", str(scan), "-o", str(model))
     built = _run("build", str(scan), "-o", str(model))
     yield (
-        f"  {built['samples']:,} samples in {built['clouds']:,} clouds, {built['bytes']:,} bytes"
+        f"  {counted(built['samples'], 'sample')} in {counted(built['clouds'], 'cloud')}, {built['bytes']:,} bytes"
         f" ({built['bits_per_sample']['total']:.1f} bits a sample), {built['seconds']:.1f} s"
     )
     yield from _announce("serve", str(folder), "--port", "0")

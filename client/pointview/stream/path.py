@@ -51,7 +51,7 @@ class ViewPath:
             entries = json.loads(path.read_text(encoding="utf-8"))
         except OSError as error:
             raise FormatError(f"{path}: cannot be read: {error.strerror}") from error
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise FormatError(f"{path}: is not JSON: {error}") from error
         if not isinstance(entries, Sequence) or isinstance(entries, str) or not entries:
             raise FormatError(f"{path}: a path is a list of at least one view, each with a time 't'")

@@ -13,7 +13,8 @@ import click
 from lpc.errors import NotFound
 from pointstream.arguments import COUNT, POSITIVE
 from pointstream.cli import CACHE, choose_cache
-from pointview.cli import MOST_THREADS, TOLERANCE, SizeType, ViewType, read_link
+from pointview.arguments import TOLERANCE, SizeType, ViewType, read_link
+from pointview.cli import MOST_THREADS
 
 
 @click.command()
@@ -47,8 +48,6 @@ def view(
     as_json: bool,
 ) -> None:
     """Open a window on MODEL, a path or address of a .lpc file; F1 shows the controls."""
-    from pointview.camera import Camera
-
     from .feed import Feed
     from .loop import run_loop
     from .screen import Screen
@@ -56,8 +55,6 @@ def view(
     from .viewer import Viewer, ViewerOptions
 
     profile = None if link is None else read_link(link)
-    if view is not None:
-        Camera.from_view(view, width=size[0], height=size[1])
     settings = Settings(tolerance=tolerance, help=model is None)
     if budget is not None:
         settings.budget, settings.limited = budget, True

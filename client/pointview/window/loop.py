@@ -37,6 +37,9 @@ class SessionReport:
         Of the last picture.
     bytes, requests : int
         Received by the feed of the last model.
+    speculative_bytes, idle_bytes, wasted_bytes : int
+        Those among them that were fetched ahead, that came while nothing was wanted, and that came ahead and no frame
+        has drawn, as in the report of `stream`.
     backend : str
     """
 
@@ -51,6 +54,9 @@ class SessionReport:
     starved: int
     bytes: int
     requests: int
+    speculative_bytes: int
+    idle_bytes: int
+    wasted_bytes: int
     backend: str
 
 
@@ -110,5 +116,8 @@ def run_loop(
         starved=0 if viewer.cut is None else int(viewer.cut.starved.sum()),
         bytes=0 if stats is None else stats.bytes_received,
         requests=0 if stats is None else stats.requests,
+        speculative_bytes=0 if stats is None else stats.speculative_bytes,
+        idle_bytes=0 if stats is None else stats.idle_bytes,
+        wasted_bytes=0 if stats is None else stats.wasted_bytes,
         backend=viewer.painter.name,
     )

@@ -25,6 +25,8 @@ _KINDS = {
 _KIND_OF = {suffix: kind for kind, suffixes in _KINDS.items() for suffix in suffixes}
 SUFFIXES = frozenset(_KIND_OF)
 _HEAD = 1 << 12
+_ADDRESS = re.compile(r"([a-z][a-z0-9+]+):/+(.*)")
+"""An address, also one that was taken for a path: that makes one slash of two."""
 
 
 def open_scan(
@@ -70,6 +72,9 @@ def detect(path: Path) -> str:
         with path.open("rb") as file:
             head = file.read(_HEAD)
     except OSError as error:
+        if (address := _ADDRESS.match(str(path))) is not None:
+            here = f"{address[1]}://{address[2]}"
+            raise ScanError(f"{here}: scans are read from files; fetch it first, and name the file") from error
         raise ScanError(f"{path}: {error.strerror or error}; name a scan file") from error
     if not head:
         raise ScanError(f"{path}: is empty; there is nothing to build")

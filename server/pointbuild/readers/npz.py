@@ -64,7 +64,6 @@ class NpzScan:
             attributes=attributes,
             raw_bytes=path.stat().st_size,
             left_out=left_out,
-            single=headers[self._position][1].str[1:] == "f4",
         )
 
     def batches(self, size: int) -> Iterator[PointBatch]:

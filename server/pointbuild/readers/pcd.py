@@ -55,7 +55,6 @@ class PcdScan:
             attributes=self._plan.dtypes,
             raw_bytes=path.stat().st_size,
             left_out=self._plan.left_out,
-            single=all(axis in dtypes and dtypes[axis].str[1:] == "f4" for axis in "xyz"),
         )
 
     def batches(self, size: int) -> Iterator[PointBatch]:

@@ -60,7 +60,6 @@ class PlyScan:
             attributes=attributes,
             raw_bytes=path.stat().st_size,
             left_out=left_out,
-            single=all(axis in singles and singles[axis].str[1:] == "f4" for axis in "xyz"),
         )
 
     def batches(self, size: int) -> Iterator[PointBatch]:

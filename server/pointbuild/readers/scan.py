@@ -72,8 +72,6 @@ class ScanInfo:
         Length of the file.
     left_out : mapping of str to str
         What the file holds and the batches do not, and why.
-    single : bool
-        Positions are stored as float32.
     scale : tuple of 3 floats or None
         Of positions that are stored as integers.
     """
@@ -85,7 +83,6 @@ class ScanInfo:
     attributes: Mapping[str, np.dtype[Any]] = field(default_factory=dict)
     raw_bytes: int = 0
     left_out: Mapping[str, str] = field(default_factory=dict)
-    single: bool = False
     scale: tuple[float, ...] | None = None
 
 

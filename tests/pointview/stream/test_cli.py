@@ -81,7 +81,7 @@ def test_wrong_arguments_exit_2(small, tmp_path, capsys, wrong):
     ("option", "content", "why"),
     [
         ("--view", "{}", "eye must be three numbers"),
-        ("--view", "[]", "no view"),
+        ("--view", "[]", "not a JSON object"),
         ("--view", "{", "not JSON"),
         ("--path", "[]", "a list of at least one view"),
         ("--path", '[{"t": 0}]', "entry 0"),
@@ -94,7 +94,7 @@ def test_a_wrong_view_or_path_is_one_line(small, tmp_path, capsys, option, conte
         path = tmp_path / "absent.json"
     else:
         path.write_text(content)
-    assert run(small, *given(tmp_path / "report"), option, path) == 1
+    assert run(small, *given(tmp_path / "report"), option, path) == 2
     assert_one_line(capsys, why)
 
 

@@ -1,24 +1,28 @@
 // One sample of a cloud: dequantised relative to the eye, projected, lit, and given its shape (see splats.py).
 //
-// COMMANDS: the cloud's parameters arrive as per-instance attributes, chosen by the base instance of an indirect
-// command. Without it they are uniforms, and every cloud is a draw of its own (OpenGL 3.3 to 4.2).
+// COMMANDS: the vertex is an attribute, and the cloud's parameters are per-instance attributes, chosen by the base
+// instance of an indirect command. Without it both are texels, found by the number of the vertex (OpenGL 3.3 to 4.2).
 // BLENDED: its shape is that of a kernel (see blend_kernels.gather).
 
-in vec4 vertex;      // x, y, z in steps; two octahedral bytes
-in vec4 color;       // 0 to 1
-
-// offset of the cloud's (0, 0, 0) from the eye, axes of model space; model units of a step
-// offset of the same from the corner of the node's cell; side of a splat, pixels times depth
-// node; its row among the places, + STARVED; its level, or -1: one spacing everywhere
+// vertex: x, y, z in steps; two octahedral bytes
+// color: 0 to 1
+// cloud_origin: offset of the cloud's (0, 0, 0) from the eye, axes of model space; model units of a step
+// cloud_corner: offset of the same from the corner of the node's cell; side of a splat, pixels times depth
+// cloud_numbers: node; its row among the places, + STARVED; its level, or -1: one spacing everywhere; samples
 #ifdef COMMANDS
+in vec4 vertex;
+in vec4 color;
 in vec4 cloud_origin;
 in vec4 cloud_corner;
 in ivec4 cloud_numbers;
 #else
-uniform ivec4 cloud[3];
-#define cloud_origin intBitsToFloat(cloud[0])
-#define cloud_corner intBitsToFloat(cloud[1])
-#define cloud_numbers cloud[2]
+uniform usampler2D vertices;
+uniform sampler2D colors;
+uniform isampler2D clouds;  // of each cloud these three, and where in the other two its first sample is
+uniform int samples;        // vertices of a cloud
+uniform int wide;           // samples in a row of texels
+vec4 vertex, color, cloud_origin, cloud_corner;
+ivec4 cloud_numbers;
 #endif
 
 uniform mat3 rotation;     // model space to camera space: right, up, depth
@@ -169,7 +173,34 @@ void drop() {
     gl_PointSize = 1.0;
 }
 
+#ifndef COMMANDS
+ivec4 told(int i) {
+    return texelFetch(clouds, ivec2(i & 1023, i >> 10), 0);
+}
+
+// Find the sample of this vertex; return false where its cloud has none.
+bool fetch() {
+    int cloud = gl_VertexID / samples;
+    int number = gl_VertexID - cloud * samples;
+    cloud_numbers = told(4 * cloud + 2);
+    if (number >= cloud_numbers.w)
+        return false;
+    cloud_origin = intBitsToFloat(told(4 * cloud));
+    cloud_corner = intBitsToFloat(told(4 * cloud + 1));
+    ivec2 at = told(4 * cloud + 3).xy + ivec2(number % wide, number / wide);
+    vertex = vec4(texelFetch(vertices, at, 0));
+    color = texelFetch(colors, at, 0);
+    return true;
+}
+#endif
+
 void main() {
+#ifndef COMMANDS
+    if (!fetch()) {
+        drop();
+        return;
+    }
+#endif
     vec3 q = cloud_origin.xyz + cloud_origin.w * vertex.xyz;
     center = rotation * q;
     float depth = center.z;
