@@ -83,49 +83,48 @@ def halvings(header: Header, levels: int) -> tuple[NDArray[np.int32], NDArray[np
 
 def places(
     header: Header,
-    drawn: Sequence[NDArray[np.bool_]],
-    missing: Sequence[NDArray[np.bool_]],
-    own: Sequence[NDArray[np.float64]],
-    shown: Sequence[NDArray[np.float64]],
+    starts: Sequence[int],
+    drawn: NDArray[np.bool_],
+    missing: NDArray[np.bool_],
+    own: NDArray[np.float64],
+    shown: NDArray[np.float64],
     below: Below,
 ) -> Places:
-    """Lay out the drawn nodes, level by level.
+    """Lay out the drawn nodes.
 
     Parameters
     ----------
-    drawn, missing : sequence of (n, 2) bool
-        For each node of a level, which children are drawn and which are missing.
-    own, shown : sequence of (n,) float64
+    starts : sequence of int
+        Where the nodes of each level start, and where the last ends.
+    drawn, missing : (n, 2) bool
+        For each node, which children are drawn and which are missing.
+    own, shown : (n,) float64
         Each node's own spacing and the largest shown around its samples.
     below : Below
         What the index says of the halves without a drawn node.
     """
-    axes, halves = halvings(header, len(drawn) + below.levels)
-    corner = np.array([header.bounds[:3]], dtype=np.float64)
-    links, spacings, corners, levels, row = [], [], [], [], 0
-    for depth, (goes_on, ends) in enumerate(zip(drawn, missing, strict=True)):
-        here = slice(row, row + len(goes_on))
-        row += len(goes_on)
-        children = int(np.count_nonzero(goes_on))
-        link = below.link[here].copy()
-        link[goes_on] = np.arange(row, row + children)
-        spacing = np.where(ends, -own[depth][:, None], shown[depth][:, None])
-        spacing = np.where(np.isnan(below.spacing[here]), spacing, below.spacing[here])
-        if children:
-            spacing[goes_on] = shown[depth + 1]
-        uniform = (link < 0).all(axis=1) & (spacing[:, 0] == spacing[:, 1])
-        links.append(link)
-        spacings.append(spacing)
-        corners.append(corner)
-        levels.append(np.where(uniform, -1, depth))
-        lower = np.repeat(corner, 2, axis=0).reshape(-1, 2, 3)
-        lower[:, 1, axes[depth]] += halves[depth]
-        corner = lower[goes_on]
+    count, levels = len(drawn), len(starts) - 1
+    axes, halves = halvings(header, levels + below.levels)
+    link, spacing = below.link.copy(), below.spacing.copy()
+    link[:count][drawn] = np.arange(1, count)  # nodes stand in the order of the halves that hold them
+    here = np.where(missing, -own[:, None], shown[:, None])
+    here = np.where(np.isnan(spacing[:count]), here, spacing[:count])
+    here[drawn] = shown[1:]
+    spacing[:count] = here
+    uniform = (link[:count, 0] < 0) & (link[:count, 1] < 0) & (here[:, 0] == here[:, 1])
+    parent, half = np.nonzero(drawn)
+    corner = np.empty((count, 3))
+    corner[0] = header.bounds[:3]
+    for depth in range(1, levels):
+        some = slice(starts[depth], starts[depth + 1])
+        above = slice(some.start - 1, some.stop - 1)  # the root has no parent
+        corner[some] = corner[parent[above]]
+        corner[some, axes[depth - 1]] += half[above] * halves[depth - 1]
     return Places(
-        link=np.concatenate([*links, below.link[row:]]),
-        spacing=np.concatenate([*spacings, below.spacing[row:]]).astype(np.float32),
-        corner=np.concatenate(corners),
-        level=np.concatenate(levels).astype(np.int32),
+        link=link,
+        spacing=spacing.astype(np.float32),
+        corner=corner,
+        level=np.where(uniform, -1, np.repeat(np.arange(levels), np.diff(starts))).astype(np.int32),
         axis=axes,
         half=halves.astype(np.float32),
     )
