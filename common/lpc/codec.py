@@ -17,7 +17,7 @@ import zstandard
 
 from .channels import Channels, channels_of, from_channels, to_channels
 from .cloud import Cloud
-from .context import Near, Part, Place, has_context, line_of, select
+from .context import Near, Part, Place, line_of, select, takes_context
 from .errors import Corrupt
 from .lattice import dequantise
 from .octahedral import decode_normals
@@ -234,7 +234,7 @@ class CloudWriter:
         self._lattice, self._rows = lattice, to_channels(codes, schema, len(lattice))
         self._channels, self._codec = channels_of(schema), _codec(engine)
         self._window, self._compressor = WINDOWS[effort], _contexts.compressor(effort)
-        self._guessing, self._flipping = has_context(schema, effort), effort != "fast"
+        self._guessing, self._flipping = takes_context(schema, effort), effort != "fast"
         # Faster strategies reuse another stream's Huffman codes in blocks up to 1 KiB, which takes up to 20 % more.
         self._small = _contexts.compressor("default" if effort == "fast" else effort)
 

@@ -27,9 +27,14 @@ ANCESTORS = 4
 """Of those further up hardly any sample is near."""
 
 
-def has_context(schema: Schema, effort: str) -> bool:
-    """Whether our writer tells clouds from their ancestors: normals and colours, but where it has to be fast."""
-    return effort != "fast" and any(attribute.kind != "scalar" for attribute in schema)
+def has_context(schema: Schema) -> bool:
+    """Whether clouds may be told from their ancestors: normals and colours are."""
+    return any(attribute.kind != "scalar" for attribute in schema)
+
+
+def takes_context(schema: Schema, effort: str) -> bool:
+    """Whether our writer tells them so: not where it has to be fast."""
+    return effort != "fast" and has_context(schema)
 
 
 def line_of(number: int, parent: Sequence[int] | NDArray[Any]) -> list[int]:

@@ -16,7 +16,7 @@ from numba import njit
 
 from lpc.bounds import decode_centers, quantise_cones, quantise_spheres
 from lpc.codec import CloudWriter, Effort
-from lpc.context import ANCESTORS, has_context, line_of, with_ancestors
+from lpc.context import ANCESTORS, line_of, takes_context, with_ancestors
 from lpc.octahedral import decode_normals, encode_normals
 from lpc.octahedral_compiled import unit_vectors
 from lpc.page import RECORD
@@ -110,7 +110,7 @@ def encode_run(
     old: OldClouds | None = None,
 ) -> Run:
     """Encode nodes `first` to `stop - 1`, but for those that are clouds of an older model."""
-    generations = ANCESTORS if has_context(schema, effort) else 0
+    generations = ANCESTORS if takes_context(schema, effort) else 0
     family = with_ancestors(np.arange(first, stop), nodes.parent, generations)
     known = ancestry.find(family[family < first].tolist())
     family = family[[node not in known for node in family.tolist()]]
