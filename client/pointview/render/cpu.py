@@ -13,7 +13,7 @@ import numpy as np
 
 from pointview import splats
 
-from . import kernels, picture_kernels, shading, splat_kernels, tables
+from . import kernels, picture_kernels, rules, shading, splat_kernels, tables
 from .arena import Arena
 from .backend import Frame, Style, Take
 from .blending import blend, linear_light
@@ -61,9 +61,9 @@ class CpuBackend:
         """Draw a cut."""
         uploads = self._upload(cut.nodes, take)
         shape = (camera.height, camera.width)
-        canvas, self._canvas = self._canvas, None  # a frame that fails leaves none
-        if canvas is None or canvas.shape != shape:
-            canvas = Canvas(*shape, self._threads, splat_kernels.padded(*shape))
+        if self._canvas is None or self._canvas.shape != shape:
+            self._canvas = Canvas(*shape, self._threads, splat_kernels.padded(*shape))
+        canvas = self._canvas
         words, colors = self._vertex.view(np.uint64).ravel(), self._color.view(np.uint32).ravel()
         clouds, cloud_of_block, row_of_block = self._clouds(cut, camera)
         places, halvings = place_table(cut)
@@ -78,6 +78,7 @@ class CpuBackend:
         background = np.array(style.background, dtype=np.uint8)
 
         def splat(worker: int) -> None:
+            canvas.keys[worker] = rules.EMPTY  # which brings it into the cache, too
             # Every `threads`-th cloud: neighbours in the array are neighbours in space, and cost alike.
             mine = np.ascontiguousarray(clouds[worker :: self._threads])
             splat_kernels.splat(canvas.keys[worker], words, mine, places, halvings, rotation, view)
@@ -105,7 +106,6 @@ class CpuBackend:
 
         self._in_parallel(splat)
         widest = max(self._in_parallel(resolve))
-        self._canvas = canvas
         if style.close_holes:
             found = self._in_parallel(find)
             into, out_of = (np.concatenate([pixels[part] for part in found]) for pixels in (holes, sources))
