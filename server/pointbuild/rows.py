@@ -65,33 +65,19 @@ def row_dtype(schema: Schema, *, short: bool = True, owned: bool = False) -> np.
 
     `short`: lattice coordinates have 32 bits. `owned`: there is also `OWNER`, in a word of its own.
     """
-    names, formats, offsets = ["xyz"], ["(3,)<i4" if short else "(3,)<i8"], [0]
-    end = row_start(short)
-
-    def fill() -> None:
-        """Make what is left of a word a field: numpy copies fields alone, and all of a row is hashed."""
-        nonlocal end
-        if whole_words(end) > end:
-            names.append(f"\0{end}")
-            formats.append(f"V{whole_words(end) - end}")
-            offsets.append(end)
-            end = whole_words(end)
-
+    fields: list[Any] = [("xyz", "<i4" if short else "<i8", (3,))]
     for attribute in sorted(schema, key=lambda entry: -entry.code_dtype.itemsize):
-        item = attribute.code_dtype
-        shape = "" if attribute.components == 1 else f"({attribute.components},)"
-        names.append(attribute.name)
-        formats.append(f"{shape}<u{item.itemsize}")
-        offsets.append(end)
-        end += item.itemsize * attribute.components
-    fill()
-    if owned:
-        names.append(OWNER)
-        formats.append("<u4")
-        offsets.append(end)
-        end += 4
-        fill()
-    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": end})
+        shape = () if attribute.components == 1 else (attribute.components,)
+        fields.append((attribute.name, f"<u{attribute.code_dtype.itemsize}", shape))
+    fields = _whole(fields)
+    return np.dtype(_whole([*fields, (OWNER, "<u4")]) if owned else fields)
+
+
+def _whole(fields: list[Any]) -> list[Any]:
+    """Make what is left of the last word a field: numpy copies fields alone, and all of a row is hashed."""
+    size = np.dtype(fields).itemsize
+    rest = whole_words(size) - size
+    return [*fields, (f"\0{size}", f"V{rest}")] if rest else fields
 
 
 def in_chunks(rows: Rows, row: int, count: int, most: int) -> Iterator[NDArray[Any]]:
