@@ -42,10 +42,16 @@ class Places:
     spacing : (n + m, 2) float32
         Spacing to close in each half, model units; the largest of it where a link goes deeper. Negative in a half
         that ends here because its node is missing.
+    spread : (n + m,) float32
+        How much further apart samples are where a half of the row ends than all of the model's would be.
+    alone : (n,) float32
+        The inverse of that for the samples of the node alone: `render.thin` knows how far apart these are.
     corner : (n, 3) float64
         Lowest corner of the node's cell, model space.
     level : (n,) int32
-        Of the node; -1 where both halves end here with one spacing, so that nothing need be looked up.
+        Of the node.
+    uniform : (n,) bool
+        Whether both halves end here with one spacing, so that nothing need be looked up.
     axis : (levels,) int32
         Axis along which the cells of a level are halved.
     half : (levels,) float32
@@ -54,8 +60,11 @@ class Places:
 
     link: NDArray[np.int32]
     spacing: NDArray[np.float32]
+    spread: NDArray[np.float32]
+    alone: NDArray[np.float32]
     corner: NDArray[np.float64]
     level: NDArray[np.int32]
+    uniform: NDArray[np.bool_]
     axis: NDArray[np.int32]
     half: NDArray[np.float32]
 
@@ -89,6 +98,7 @@ def places(
     own: NDArray[np.float64],
     shown: NDArray[np.float64],
     below: Below,
+    alone: NDArray[np.float64],
 ) -> Places:
     """Lay out the drawn nodes.
 
@@ -102,6 +112,8 @@ def places(
         Each node's own spacing and the largest shown around its samples.
     below : Below
         What the index says of the halves without a drawn node.
+    alone : (n,) float64
+        See `Places`.
     """
     count, levels = len(drawn), len(starts) - 1
     axes, halves = halvings(header, levels + below.levels)
@@ -123,8 +135,11 @@ def places(
     return Places(
         link=link,
         spacing=spacing.astype(np.float32),
+        spread=below.spread.astype(np.float32),
+        alone=alone.astype(np.float32),
         corner=corner,
-        level=np.where(uniform, -1, np.repeat(np.arange(levels), np.diff(starts))).astype(np.int32),
+        level=np.repeat(np.arange(levels, dtype=np.int32), np.diff(starts)),
+        uniform=uniform,
         axis=axes,
         half=halves.astype(np.float32),
     )

@@ -271,7 +271,8 @@ def refine(
     else:
         below = look_below(index, camera, nodes, drawn, missing)
         spacing = _shown_spacing(starts, drawn, np.where(ends, own, 0.0), below.spacing[: len(nodes)])
-        laid_out = places(index.header, starts, drawn, missing, own, spacing, below)
+        alone = np.sqrt(index.density.own[nodes])
+        laid_out = places(index.header, starts, drawn, missing, own, spacing, below, alone)
     # A splat at the nearest point of the sphere; without bound but the largest where the eye is inside it.
     splat_px = np.ones(len(nodes))
     grown = spacing > 0

@@ -68,6 +68,7 @@ def test_a_whole_copy_is_the_origins_bytes(model: bytes, tmp_path: Path) -> None
     assert out.read_bytes() == model
     assert [path.name for path in out.parent.iterdir()] == ["model.lpc"]
     assert (report.complete, report.bytes, report.clouds) == (True, len(model), report.clouds_total)
+    assert report.bytes_fetched == len(model), "what the opening brought too"
     again = origin_of(model)
     assert copy(again, out).bytes_fetched == 0
     assert asked(again) == parse_header(model).page0
@@ -89,7 +90,8 @@ def test_a_region_is_a_model_that_has_every_sample_of_the_region(model: bytes, t
         assert 0 < len(mine) < len(part.read()) < len(whole.read())
     assert command.run(["verify", str(out)]) == 1
     rest = origin_of(model)
-    assert copy(rest, out).complete
+    completed = copy(rest, out)
+    assert (completed.complete, completed.bytes_fetched) == (True, len(model) - report.bytes)
     assert out.read_bytes() == model
     assert not map_path(out).exists()
     assert asked(rest) < len(model), "what was here is fetched again"

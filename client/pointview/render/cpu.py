@@ -19,7 +19,7 @@ from .backend import Frame, Style, Take
 from .blending import blend, linear_light
 from .canvas import Canvas
 from .pack import Packer
-from .seen import place_table
+from .seen import look_ups, place_table
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -81,7 +81,7 @@ class CpuBackend:
             canvas.keys[worker] = rules.EMPTY  # which brings it into the cache, too
             # Every `threads`-th cloud: neighbours in the array are neighbours in space, and cost alike.
             mine = np.ascontiguousarray(clouds[worker :: self._threads])
-            splat_kernels.splat(canvas.keys[worker], words, mine, places, halvings, rotation, view)
+            splat_kernels.splat(canvas.keys[worker], words, colors, mine, places, halvings, rotation, view)
 
         def rows(worker: int) -> tuple[int, int]:
             return camera.height * worker // self._threads, camera.height * (worker + 1) // self._threads
@@ -100,8 +100,9 @@ class CpuBackend:
             largest = min(splats.LARGEST_HOLE, math.ceil(splats.HOLE * widest))
             top, bottom = rows(worker)
             found = picture_kernels.close_holes(
-                depth, side, holes, sources, top, bottom, camera.focal, splats.HOLE, largest, splats.WALLS
-            )
+                depth, side, holes, sources, top, bottom, camera.focal,
+                splats.HOLE, largest, splats.WALLS, splats.FACES, splats.FACE,
+            )  # fmt: skip
             return slice(top * camera.width, top * camera.width + found)
 
         self._in_parallel(splat)
@@ -168,9 +169,10 @@ class CpuBackend:
         clouds["x"], clouds["y"], clouds["z"] = offset.T
         clouds["scale"] = self._arena.scale[slots]
         clouds["spacing"], clouds["starved"] = cut.spacing, cut.starved
-        clouds["row"], clouds["level"] = np.arange(len(slots)), -1
+        clouds["row"], clouds["thin"] = np.arange(len(slots)), self._arena.thin[slots]
+        clouds["level"] = look_ups(cut, slice(None), self._arena.thin[slots])
         if cut.places is not None:
-            clouds["level"] = cut.places.level
+            clouds["alone"] = self._arena.scale[slots] * cut.places.alone
             corner = self._arena.origin[slots] - cut.places.corner
             clouds["corner_x"], clouds["corner_y"], clouds["corner_z"] = corner.T
         cloud_of_block = np.repeat(np.arange(len(slots), dtype=np.int32), blocks)

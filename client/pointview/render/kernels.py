@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numba
 import numpy as np
 
-from .rules import EMPTY, F, direction, plane_of, spacing_at, x_of, y_of, z_of
+from .rules import EMPTY, F, direction, plane_of, spacing_at, spacing_in, x_of, y_of, z_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -89,10 +89,11 @@ def resolve(
             code[k] = np.int32(word[k] >> np.uint64(48))
             spacing, hungry = cloud.spacing, cloud.starved
             if cloud.level >= 0:
+                full = spacing_in(cloud, color[k] >> np.uint32(24))
                 inside_x = cloud.corner_x + cloud.scale * x_of(word[k])
                 inside_y = cloud.corner_y + cloud.scale * y_of(word[k])
                 inside_z = cloud.corner_z + cloud.scale * z_of(word[k])
-                spacing, hungry = spacing_at(cloud, inside_x, inside_y, inside_z, view.reach, places, halvings)
+                spacing, hungry = spacing_at(cloud, inside_x, inside_y, inside_z, view.reach, full, places, halvings)
             across[k] = spacing
             node[row, column_of[k]], starved[row, column_of[k]] = cloud.node, hungry
         _measure(here[:count], across, x, y, z, rotation, view)
@@ -234,7 +235,6 @@ def seen(
     count = 0
     for c in range(len(clouds)):
         cloud = clouds[c]
-        spacing = cloud.spacing
         for i in range(cloud.first, cloud.first + cloud.count):
             x = cloud.x + cloud.scale * F(vertex[i, 0])
             y = cloud.y + cloud.scale * F(vertex[i, 1])
@@ -247,11 +247,13 @@ def seen(
                 nx, ny, nz = direction(code)
                 if nx * x + ny * y + nz * z > F(0.0):
                     continue
+            spacing = cloud.spacing
             if cloud.level >= 0:
+                full = spacing_in(cloud, color[i, 3])
                 inside_x = cloud.corner_x + cloud.scale * F(vertex[i, 0])
                 inside_y = cloud.corner_y + cloud.scale * F(vertex[i, 1])
                 inside_z = cloud.corner_z + cloud.scale * F(vertex[i, 2])
-                spacing, _ = spacing_at(cloud, inside_x, inside_y, inside_z, view.reach, places, halvings)
+                spacing, _ = spacing_at(cloud, inside_x, inside_y, inside_z, view.reach, full, places, halvings)
             right = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
             up = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
             plane = (F(0.0), F(0.0), F(-1.0))

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numba
 import numpy as np
 
-from .rules import EMPTY, F, direction, key_of, plane_of, spacing_at, x_of, y_of, z_of
+from .rules import EMPTY, F, direction, key_of, plane_of, spacing_at, spacing_in, x_of, y_of, z_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -291,6 +291,7 @@ def _fill(
 def splat(
     keys: NDArray[np.uint64],
     words: NDArray[np.uint64],
+    colors: NDArray[np.uint32],
     clouds: NDArray[Any],
     places: NDArray[Any],
     halvings: NDArray[Any],
@@ -305,6 +306,8 @@ def splat(
         EMPTY, or what earlier calls left; see `padded`.
     words : (n,) uint64
         x, y, z, normal: 16 bits each, the first in the lowest.
+    colors : (n,) uint32
+        Of which the code of `thin` is looked at, the highest byte.
     clouds : (k,) CLOUD
     places : (n,) PLACE
     halvings : (levels,) HALVING
@@ -334,7 +337,8 @@ def splat(
                         x = cloud.corner_x + cloud.scale * x_of(batch[i])
                         y = cloud.corner_y + cloud.scale * y_of(batch[i])
                         z = cloud.corner_z + cloud.scale * z_of(batch[i])
-                        spacing, _ = spacing_at(cloud, x, y, z, view.reach, places, halvings)
+                        full = spacing_in(cloud, colors[first + i] >> np.uint32(24)) if cloud.thin else F(0.0)
+                        spacing, _ = spacing_at(cloud, x, y, z, view.reach, full, places, halvings)
                         sides[i] = min(spacing * view.closing * (F(1.0) / depths[i]), view.largest)
             _box(left, top, columns, rows, px[:count], py, sides, view)
             _fill(keys, int(width), int(place), depths, left, top, columns[:count], rows[:count])

@@ -45,7 +45,7 @@ def test_build_serve_stream_and_five_figures(tmp_path, rooms):
     assert len(figures) == 5
     assert re.search(rf"first picture +{report['first_picture_s']:.2f} s", figures[0])
     assert f"error after {report['curve'][-1]['t']:.3g} s" in figures[2]
-    assert f"in {report['requests']} requests" in figures[4]
+    assert f"in {report['requests']} request" in figures[4]
 
 
 def test_a_command_that_fails_ends_the_tour(tmp_path, rooms, capfd):
