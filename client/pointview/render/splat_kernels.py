@@ -131,7 +131,7 @@ def _disc(
                 apart = dx * dx + dy * dy + dz * dz
                 covered = (apart <= reach) & (t > F(0.0)) & (column < end) & (row < bottom)
                 block[k] = key_of(t + bulge * apart, place) if covered else EMPTY
-            _write(keys, block, bits, np.int32(view.width), np.int32(upper), np.int32(near))
+            _write(keys, block, bits, np.int32(view.width), np.int32(upper), bottom, np.int32(near))
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
@@ -160,19 +160,25 @@ def _ball(
                 apart = dx * dx + dy * dy
                 covered = (apart <= reach) & (column < end) & (row < bottom)
                 block[k] = key_of(depth + bulge * apart, place) if covered else EMPTY
-            _write(keys, block, bits, np.int32(view.width), np.int32(upper), np.int32(near))
+            _write(keys, block, bits, np.int32(view.width), np.int32(upper), bottom, np.int32(near))
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _write(
-    keys: NDArray[np.uint64], block: NDArray[np.uint64], bits: np.int32, width: np.int32, top: np.int32, left: np.int32
+    keys: NDArray[np.uint64],
+    block: NDArray[np.uint64],
+    bits: np.int32,
+    width: np.int32,
+    top: np.int32,
+    bottom: np.int32,
+    left: np.int32,
 ) -> None:  # pragma: no cover - compiled
     """Keep the smaller of the keys in a block of pixels and those there."""
     start = top * width + left
-    for k in range(BLOCK):
-        down, across = np.int32(k) >> bits, np.int32(k) & ((np.int32(1) << bits) - np.int32(1))
-        spot = np.uint32(start + down * width + across)
-        keys[spot] = min(keys[spot], block[k])
+    for row in range(min(bottom - top, np.int32(BLOCK >> bits))):
+        line, own = keys[np.uint32(start + row * width) :], block[np.uint32(row << bits) :]
+        for column in range(1 << bits):
+            line[column] = min(line[column], own[column])
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -280,7 +286,8 @@ def _fill(
         if rows[i] == 0:
             continue
         key, start = key_of(depths[i], place + i), top[i] * width + left[i]
-        for row in range(highest):
+        # Two rows cost less than a branch on whether it is one, three do not.
+        for row in range(rows[i] if highest > 2 else highest):
             for column in range(widest):
                 spot = np.uint32(start + row * width + column)
                 inside = (row < rows[i]) & (column < columns[i])
