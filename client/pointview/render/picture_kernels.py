@@ -98,7 +98,7 @@ def close_holes(
     largest : int
         And at most this many pixels.
     walls : int
-        Directions, of eight, in which a hole has walls.
+        Directions, of eight, in which a hole has walls; 7 or 8, as `_between_walls` takes for granted.
     faces, face : int, float
         In so many of these a wall goes on into the hole, by its slope over so many sides of its splat.
 
