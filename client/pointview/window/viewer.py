@@ -115,7 +115,7 @@ class Viewer:
         """Show another model in place of the present one."""
         self._close_feed()
         self.mirror, self.view, self.cut, self.frame, self.scene = Mirror(), None, None, None, None
-        self.message, self.loaded, self._errors = "", (0, 0), {}
+        self.message, self._told_at, self.loaded, self._errors = "", -1e9, (0, 0), {}
         self.settings.up, self.settings.help = None, False
         self.feed = self._open_feed(target)
 
@@ -168,14 +168,14 @@ class Viewer:
     def advance(self, did: Inputs) -> NDArray[np.uint8] | None:
         """Take in a frame's input and what came; return the new picture, or None if it is the same."""
         now = self._clock()
-        if now - self._told_at > NOTICE and not self.mirror.failure:
+        if now - self._told_at > NOTICE:
             self.message = ""
         obey(self, did)
         if self.feed is None:
             return None
         news = self.mirror.take_in(self.feed.news())
-        if self.mirror.failure:
-            self.message = self.mirror.failure
+        if self.mirror.failure and now - self._told_at > NOTICE:
+            self.message = self.mirror.failure  # what was told since comes first
         self._hear(self.feed)
         if self.mirror.index is None:
             return None
