@@ -2,8 +2,8 @@
 
 MODEL is the mixing interface of `scripts/make_mixing_interface`, built. It is seen from four sides in 335 x 335 pixels
 at a tolerance of one, as in LPC figure 3: splats drawn with and without culling, and the share of the covered pixels
-that differ. Then it is streamed over ADSL both ways, and the table says when the error (root mean square difference to
-everything resident) falls to shares of the first picture's.
+that differ. Then it is streamed over ADSL both ways, with both priorities, and the table says when the error (root mean
+square difference to everything resident) falls to shares of the first picture's.
 """
 
 from __future__ import annotations
@@ -43,13 +43,15 @@ def main() -> None:
         differ = (whole.frame.rgb != seen.frame.rgb).any(axis=2)[covered].mean()
         ratio = whole.frame.splats / seen.frame.splats
         print(f"{turn:6d} {whole.frame.splats:10,} {seen.frame.splats:10,} {ratio:6.1f} {100 * differ:18.3f}%")
-    print(f"{'ADSL':>6} {'settled s':>10} {'bytes':>11}" + "".join(f"{f'{share:.0%} s':>8}" for share in SHARES))
-    for occlusion in ("off", "auto"):
-        report = _stream(path, views[0], occlusion)
-        errors = [(e["t"], 255 * 10 ** (-(e["psnr_db"] or math.inf) / 20)) for e in report.curve if e["splats"]]
-        times = "".join(f"{_reached(errors, share * errors[0][1]):>8}" for share in SHARES)
-        settled = "-" if report.settled_s is None else f"{report.settled_s:.1f}"
-        print(f"{occlusion:>6} {settled:>10} {report.bytes:11,}{times}")
+    shares = "".join(f"{f'{share:.0%} s':>8}" for share in SHARES)
+    print(f"{'ADSL':>6} {'priority':>9} {'settled s':>10} {'bytes':>11}{shares}")
+    for priority in ("index", "error"):
+        for occlusion in ("off", "auto"):
+            report = _stream(path, views[0], occlusion, priority)
+            errors = [(e["t"], 255 * 10 ** (-(e["psnr_db"] or math.inf) / 20)) for e in report.curve if e["splats"]]
+            times = "".join(f"{_reached(errors, share * errors[0][1]):>8}" for share in SHARES)
+            settled = "-" if report.settled_s is None else f"{report.settled_s:.1f}"
+            print(f"{occlusion:>6} {priority:>9} {settled:>10} {report.bytes:11,}{times}")
 
 
 def _view(path: str, turn: float) -> dict[str, Any]:
@@ -65,7 +67,7 @@ def _still(path: str, view: dict[str, Any], occlusion: bool) -> Any:
     return asyncio.run(draw_still(path, StillOptions(width=SIDE, height=SIDE, view=view, occlusion=occlusion)))
 
 
-def _stream(path: str, view: dict[str, Any], occlusion: Any) -> Any:
+def _stream(path: str, view: dict[str, Any], occlusion: Any, priority: Any) -> Any:
     experiment = Experiment(
         model=path,
         link="adsl",
@@ -74,7 +76,7 @@ def _stream(path: str, view: dict[str, Any], occlusion: Any) -> Any:
         seconds=SECONDS,
         size=(SIDE, SIDE),
         tolerance=1.0,
-        priority="index",
+        priority=priority,
         occlusion=occlusion,
         views=ViewPath.still(view),
     )
