@@ -96,7 +96,7 @@ def places(
     drawn, missing : sequence of (n, 2) bool
         For each node of a level, which children are drawn and which are missing.
     own, shown : sequence of (n,) float64
-        Each node's own spacing and the largest shown around its samples.
+        The spacing that each node's own samples close (`snug`), and the largest shown around its samples.
     below : Below
         What the index says of the halves without a drawn node.
     """

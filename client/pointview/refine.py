@@ -10,8 +10,8 @@ array of node numbers and every test below is one numpy expression over it.
    sphere nearest to the eye; infinite where the eye is inside. Below the tolerance the node is fine enough.
 3. Otherwise its children refine it: one whose record is unknown makes its page wanted; one that is not resident is
    wanted itself; one that is resident is visited. A node with a visible child that cannot be drawn yet is *starved*.
-4. Splats show the spacing of the deepest drawn node at their place (`places`): no holes where data is missing, and no
-   fat beside it. LPC's plain rule, one size a cloud, is there for comparison.
+4. Splats show the spacing of the deepest drawn node at their place (`places`), or less where that does (`snug`): no
+   holes where data is missing, and no fat beside it. LPC's plain rule, one size a cloud, is there for comparison.
 
 Nothing here does I/O or reads a clock; equal arguments give equal cuts.
 """
@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .places import Places, places
+from .snug import snug
 from .splats import CLOSING, LARGEST
 from .uneven import look_below
 
@@ -254,6 +255,8 @@ def refine(
         laid_out = None
     else:
         drawn, missing = [level.drawn for level in levels], [level.missing for level in levels]
+        to_close = np.concatenate(own) * snug(index, nodes, spacing_px)
+        own = np.split(to_close, np.cumsum([len(level.nodes) for level in levels[:-1]]))
         below = look_below(index, camera, nodes, np.concatenate(drawn), np.concatenate(missing))
         shown = _shown_spacing(levels, own, below.spacing)
         spacing = np.concatenate(shown)
