@@ -7,8 +7,9 @@ with an error bound of r / 2 and 8 + 8 bits a normal. Sizes include the frame an
 from __future__ import annotations
 
 import time
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import asked
 import numpy as np
@@ -18,7 +19,8 @@ from scipy.spatial import cKDTree
 
 from lpc.attributes import Attribute, Schema
 from lpc.channels import channels_of
-from lpc.codec import decode_cloud, encode_cloud
+from lpc.codec import decode_cloud, encode_clouds
+from lpc.context import line_of
 from lpc.lattice import position_step, quantise
 from lpc.octahedral import encode_normals
 from lpc.payload import RAW_BITS, parse_layout
@@ -27,6 +29,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
+
+    from lpc.cloud import Cloud
+    from lpc.codec import Effort, Engine
 
 NORMAL = Attribute(name="normal", kind="normal", dtype="<f4", bits=8)
 COLOR = Attribute(name="color", kind="color", dtype="|u1", bits=8)
@@ -91,12 +96,14 @@ def model_spacing(xyz: NDArray[np.float64], seed: int) -> float:
     return float(np.median(cKDTree(xyz).query(some, 9)[0][:, 8]) * np.sqrt(np.pi / 8))
 
 
-def clouds(xyz: NDArray[np.float64], size: int, seed: int) -> Iterator[NDArray[np.int64]]:
-    """Sample numbers of each node."""
-    todo = [(np.random.default_rng(seed).permutation(len(xyz)), xyz.min(axis=0), xyz.max(axis=0))]
+def clouds(xyz: NDArray[np.float64], size: int, seed: int) -> Iterator[tuple[NDArray[np.int64], int]]:
+    """Sample numbers of each node, and the number of its parent; -1 for the root."""
+    todo = [(np.random.default_rng(seed).permutation(len(xyz)), xyz.min(axis=0), xyz.max(axis=0), -1)]
+    count = 0
     while todo:
-        members, low, high = todo.pop()
-        yield members[:size]
+        members, low, high, parent = todo.pop()
+        yield members[:size], parent
+        number, count = count, count + 1
         rest = members[size:]
         if len(rest):
             axis = int(np.argmax(high - low))
@@ -106,7 +113,7 @@ def clouds(xyz: NDArray[np.float64], size: int, seed: int) -> Iterator[NDArray[n
                 cut = bound.copy()
                 cut[axis] = middle
                 if len(side):
-                    todo.append((side, low, cut) if which else (side, cut, high))
+                    todo.append((side, low, cut, number) if which else (side, cut, high, number))
 
 
 def stream_bits(frame: bytes, samples: int, schema: Schema) -> dict[str, float]:
@@ -142,38 +149,59 @@ def rate(work: Callable[[], object], samples: int, repeats: int) -> float:
     return samples / best / 1e6
 
 
-def measure(path: Path, size: int, effort: str, repeats: int, with_color: bool) -> None:
-    xyz, normals, color = load(path)
-    spacing = model_spacing(xyz, 1)
-    lattice = quantise(xyz, xyz.min(axis=0), position_step(spacing, float(np.ptp(xyz, axis=0).max())))
-    codes = {"normal": encode_normals(normals)}
-    schema: Schema = (NORMAL,)
-    if with_color and color is not None:
-        schema, codes["color"] = (NORMAL, COLOR), color
-    parts = [(lattice[which], {name: code[which] for name, code in codes.items()}) for which in clouds(xyz, size, 2)]
-    counts = [len(part) for part, _ in parts]
+class Scan(NamedTuple):
+    """Clouds of a scan one after another, and the number of each one's parent."""
 
-    def encode() -> list[bytes]:
-        return [encode_cloud(part, code, schema, effort=effort) for part, code in parts]
+    lattice: NDArray[np.int64]
+    codes: dict[str, NDArray[Any]]
+    schema: Schema
+    bounds: NDArray[np.int64]
+    parent: list[int]
 
-    frames = encode()
+    @classmethod
+    def of(cls, path: Path, size: int, with_color: bool) -> Scan:
+        xyz, normals, color = load(path)
+        spacing = model_spacing(xyz, 1)
+        lattice = quantise(xyz, xyz.min(axis=0), position_step(spacing, float(np.ptp(xyz, axis=0).max())))
+        codes: dict[str, NDArray[Any]] = {"normal": encode_normals(normals)}
+        schema: Schema = (NORMAL,)
+        if with_color and color is not None:
+            schema, codes["color"] = (NORMAL, COLOR), color
+        parts = list(clouds(xyz, size, 2))
+        order = np.concatenate([part for part, _ in parts])
+        bounds = np.cumsum([0, *(len(part) for part, _ in parts)])
+        parent = [parent for _, parent in parts]
+        return cls(lattice[order], {name: code[order] for name, code in codes.items()}, schema, bounds, parent)
+
+    def encode(self, effort: Effort) -> list[bytes]:
+        parent = np.array(self.parent)
+        return encode_clouds(self.lattice, self.codes, self.bounds, self.schema, parent=parent, effort=effort)
+
+    def decode(self, frames: list[bytes], engine: Engine) -> None:
+        known: list[Cloud] = []
+        counts = np.diff(self.bounds).tolist()
+        for number, (frame, count) in enumerate(zip(frames, counts, strict=True)):
+            context = [known[above] for above in line_of(number, self.parent)]
+            known.append(decode_cloud(frame, samples=count, schema=self.schema, context=context, engine=engine))
+
+
+def measure(path: Path, size: int, effort: Effort, repeats: int, with_color: bool) -> None:
+    scan = Scan.of(path, size, with_color)
+    counts, samples = np.diff(scan.bounds).tolist(), len(scan.lattice)
+    frames = scan.encode(effort)
     totals: dict[str, float] = {}
     for frame, count in zip(frames, counts, strict=True):
-        for name, bits in stream_bits(frame, count, schema).items():
+        for name, bits in stream_bits(frame, count, scan.schema).items():
             totals[name] = totals.get(name, 0.0) + bits
-    speeds = [rate(encode, len(xyz), repeats)]
-    for engine in ("compiled", "numpy"):
-
-        def decode(engine: str = engine) -> None:
-            for frame, count in zip(frames, counts, strict=True):
-                decode_cloud(frame, samples=count, schema=schema, engine=engine)
-
-        decode()
-        speeds.append(rate(decode, len(xyz), repeats))
-    bits = {name: totals.get(name, 0.0) / len(xyz) for name in ("position", "normal", "color", "header")}
-    total = 8 * sum(map(len, frames)) / len(xyz)
+    speeds = [rate(lambda: scan.encode(effort), samples, repeats)]
+    engines: tuple[Engine, ...] = ("compiled", "numpy")
+    for engine in engines:
+        scan.decode(frames, engine)
+        speeds.append(rate(partial(scan.decode, frames, engine), samples, repeats))
+    bits = {name: totals.get(name, 0.0) / samples for name in ("position", "normal", "color", "header")}
+    total = 8 * sum(map(len, frames)) / samples
     print(
-        f"{path.name:24} {len(xyz):9,} {len(parts):6,} " + " ".join(f"{value:8.2f}" for value in bits.values())
+        f"{path.name:24} {samples:9,} {len(counts):6,} " + " ".join(f"{value:8.2f}" for value in bits.values())
         + f" {total:8.2f} {1 / speeds[0]:7.2f} {speeds[1]:7.2f} {speeds[2]:7.2f}"
     )  # fmt: skip
 

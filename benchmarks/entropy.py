@@ -14,18 +14,16 @@ from typing import TYPE_CHECKING
 import asked
 import numpy as np
 import zstandard
-from codec import COLOR, NORMAL, OBJECTS, clouds, load, model_spacing, stream_bits
+from codec import OBJECTS, Scan, stream_bits
 
 from lpc.channels import channels_of
-from lpc.codec import encode_cloud
-from lpc.lattice import position_step, quantise
-from lpc.octahedral import encode_normals
 from lpc.payload import RAW_BITS, parse_layout
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from lpc.attributes import Schema
+    from lpc.codec import Effort
 
 NAMES = ("position", "normal", "color")
 
@@ -48,21 +46,15 @@ def entropy(counts: NDArray[np.int64]) -> float:
     return float(-(some * np.log2(some / some.sum())).sum())
 
 
-def measure(path: Path, size: int, effort: str, with_color: bool) -> None:
-    xyz, normals, color = load(path)
-    spacing = model_spacing(xyz, 1)
-    lattice = quantise(xyz, xyz.min(axis=0), position_step(spacing, float(np.ptp(xyz, axis=0).max())))
-    codes = {"normal": encode_normals(normals)}
-    schema: Schema = (NORMAL,)
-    if with_color and color is not None:
-        schema, codes["color"] = (NORMAL, COLOR), color
+def measure(path: Path, size: int, effort: Effort, with_color: bool) -> None:
+    scan = Scan.of(path, size, with_color)
+    schema, samples = scan.schema, len(scan.lattice)
     stored, own, raw = defaultdict(float), defaultdict(float), defaultdict(float)
     pooled: dict[tuple[str, int], NDArray[np.int64]] = defaultdict(lambda: np.zeros(256, np.int64))
-    for which in clouds(xyz, size, 2):
-        frame = encode_cloud(lattice[which], {name: code[which] for name, code in codes.items()}, schema, effort=effort)
-        for name, bits in stream_bits(frame, len(which), schema).items():
+    for frame, count in zip(scan.encode(effort), np.diff(scan.bounds).tolist(), strict=True):
+        for name, bits in stream_bits(frame, count, schema).items():
             stored[name] += bits
-        for name, parts in streams(frame, len(which), schema).items():
+        for name, parts in streams(frame, count, schema).items():
             for number, tokens in enumerate(parts):
                 counts = np.bincount(tokens, minlength=256)
                 own[name] += entropy(counts)
@@ -76,12 +68,12 @@ def measure(path: Path, size: int, effort: str, with_color: bool) -> None:
         ("scan", {name: shared[name] + raw[name] for name in NAMES}),
         ("raw", raw),
     ):
-        parts = [values.get(name, 0.0) / len(xyz) for name in NAMES]
+        parts = [values.get(name, 0.0) / samples for name in NAMES]
         most = sum(values.values())
         print(
             f"{path.name if kind == 'stored' else '':24} {kind:>8} "
             + " ".join(f"{part:8.2f}" for part in parts)
-            + f" {most / len(xyz):8.2f}"
+            + f" {most / samples:8.2f}"
             + (f" {100 * (total / most - 1):7.1f} %" if kind in ("cloud", "scan") else "")
         )
 

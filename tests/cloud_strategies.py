@@ -14,6 +14,8 @@ from lpc.octahedral import encode_normals
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from lpc.cloud import Cloud
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RawCloud:
@@ -75,3 +77,23 @@ def raw_clouds(draw: st.DrawFn, most: int = 200) -> RawCloud:
     smooth = draw(st.booleans())
     codes = {attribute.name: random_codes(rng, attribute, samples, smooth) for attribute in schema}
     return RawCloud(lattice=lattice, codes=codes, schema=schema)
+
+
+def rows(lattice: Any, codes: dict[str, Any]) -> list[list[int]]:
+    """Samples with their codes as lists of integers, sorted: to compare as sets with repetitions."""
+    parts = [np.asarray(lattice).astype(object)]
+    parts += [np.asarray(values).reshape(len(parts[0]), -1).astype(object) for values in codes.values()]
+    return sorted(np.concatenate(parts, axis=1).tolist())
+
+
+def assert_same(first: Cloud, second: Cloud) -> None:
+    assert first.shift == second.shift
+    np.testing.assert_array_equal(first.origin, second.origin)
+    np.testing.assert_array_equal(first.position, second.position)
+    assert (first.low is None) == (second.low is None)
+    if first.low is not None and second.low is not None:
+        np.testing.assert_array_equal(first.low, second.low)
+    assert first.codes.keys() == second.codes.keys()
+    for name, values in first.codes.items():
+        assert values.dtype == second.codes[name].dtype
+        np.testing.assert_array_equal(values, second.codes[name])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,10 @@ if TYPE_CHECKING:
 # Fixed seeds, and no clock in the verdict: a busy machine must not turn a test red.
 settings.register_profile("pointstream", derandomize=True, deadline=None)
 settings.load_profile("pointstream")
+
+# A shell that runs tests in the background has them, and all that they start, ignore interrupts: some tests send them.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

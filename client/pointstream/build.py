@@ -5,12 +5,14 @@ When the host changes the model, all of this is replaced by a new one in one ste
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from lpc.context import ANCESTORS, has_context
 from lpc.ranges import ByteRange
 
+from .lineage import ancestors
 from .offers import Item
 from .residency import Residency
 
@@ -18,9 +20,18 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from lpc.cloud import Cloud
+    from lpc.errors import Corrupt
     from lpc.index import IndexTree
 
     from .stores import Store
+
+
+class Arrived(NamedTuple):
+    """A cloud's bytes, and how many of them came ahead of any want."""
+
+    item: Item
+    data: bytes
+    ahead: int
 
 
 class Build:
@@ -44,12 +55,17 @@ class Build:
         Arrived and being decoded.
     held : ndarray, (nodes,) bool
         The store has them without asking over a link.
+    waiting : dict of int to list
+        What arrived and can be decoded after a node that is not here yet, by that node.
+    waiting_bytes : int
+        Of these.
     tail : (int, bytes)
         The start of an object that the opening cut in two, and where in the file it begins; given out once.
     """
 
     def __init__(self, index: IndexTree, *, capacity: int, store: Store) -> None:
         self.index, self._store = index, store
+        self._sample_bytes = 6 + sum(entry.code_dtype.itemsize * entry.components for entry in index.header.attributes)
         self.residency = Residency(len(index), capacity)
         self.clouds: dict[int, Cloud] = {}
         self.absent: NDArray[np.bool_] = np.zeros(len(index), dtype=bool)
@@ -57,6 +73,8 @@ class Build:
         self.held: NDArray[np.bool_] = np.zeros(len(index), dtype=bool)
         self.length = index.header.bytes if store.length is None else min(index.header.bytes, store.length)
         self.lost_pages: set[int] = set()
+        self.waiting: dict[int, list[Arrived]] = {}
+        self.waiting_bytes = self._waiting_decoded = 0
         self.tail: tuple[int, bytes] = (0, b"")
         self._failures: dict[int, int] = {}
         for page in np.flatnonzero(index.page_loaded).tolist():
@@ -69,6 +87,7 @@ class Build:
         stops = self.index.offset[rows] + self.index.size[rows]
         self.held[rows] = self._store.holds(self.index.offset[rows], stops)
         self.absent[rows] = (stops > self.length) | (self._store.partial & ~self.held[rows])
+        self._bereave(np.arange(rows.start, min(rows.stop, len(self.index))))
 
     def take_tail(self, wanted: ByteRange) -> bytes:
         """Give the first bytes of a range, if they came with the opening and others are still to come."""
@@ -107,7 +126,78 @@ class Build:
             self.lost_pages.add(~key)
         else:
             self.absent[key] = True
+            below = np.array([key])
+            while below.size:
+                below = self.index.children[below[self.index.known[below]]]
+                below = below[below >= 0].astype(np.int64)
+                self._bereave(below)
         return True
+
+    def family(self, node: int) -> dict[int, Cloud | Corrupt] | int:
+        """Give the clouds that a node's is told from, or the first of them that is not here."""
+        line = ancestors(self.index, node)
+        for above in line:
+            if above not in self.clouds:
+                return above
+        return {above: self.clouds[above] for above in line}
+
+    def wait(self, came: Arrived, above: int) -> None:
+        """Keep what can only be decoded after a node."""
+        self.waiting.setdefault(above, []).append(came)
+        self.waiting_bytes += len(came.data)
+        self._waiting_decoded += self._decoded_bytes(came)
+
+    def release(self, above: int) -> list[Arrived]:
+        """Give what waits for a node, and keep it no longer."""
+        released = self.waiting.pop(above, [])
+        self.waiting_bytes -= sum(len(came.data) for came in released)
+        self._waiting_decoded -= sum(map(self._decoded_bytes, released))
+        return released
+
+    def forget(self, nodes: list[int]) -> None:
+        """Let go of what waits for nodes, and of what waits for that: if it is wanted it is asked for again."""
+        while nodes:
+            for came in self.release(nodes.pop()):
+                self.busy[came.item.key] = False
+                nodes.append(came.item.key)
+
+    def roomy(self, flying: list[int]) -> bool:
+        """Whether there is room for more ahead of wants, beside what has come and waits and the clouds in flight."""
+        flying = [node for node in flying if not (self.busy[node] or self.residency.resident[node])]
+        return self.residency.roomy(self._waiting_decoded + int(self.index.samples[flying].sum()) * self._sample_bytes)
+
+    def _decoded_bytes(self, came: Arrived) -> int:
+        return int(self.index.samples[came.item.key]) * self._sample_bytes
+
+    def _with_ancestors(self, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Put before nodes those that are not here and without which they cannot be decoded."""
+        if not has_context(self.index.header.attributes):
+            return nodes
+        resident, parent = self.residency.resident, self.index.parent
+        line, rank = nodes[self.index.linked[nodes]], np.flatnonzero(self.index.linked[nodes])
+        left = np.full(len(line), ANCESTORS)
+        found, ranks = [nodes], [np.arange(len(nodes))]
+        while len(line):
+            line = parent[line].astype(np.int64)
+            here = resident[line] & (line >= 0)
+            left = np.where(here, left - 1, ANCESTORS)  # whoever is not here needs its own, too
+            up = (line >= 0) & (left > 0)
+            line, rank, left, here = line[up], rank[up], left[up], here[up]
+            found.append(line[~here])
+            ranks.append(rank[~here])
+        keys = np.concatenate(found)
+        order = np.lexsort((keys, np.concatenate(ranks)))  # as urgent as the most urgent of its descendants
+        keys = keys[order]
+        _, first = np.unique(keys, return_index=True)
+        return keys[np.sort(first)]
+
+    def _bereave(self, nodes: NDArray[np.int64]) -> None:
+        """Mark nodes as absent, in their order, whose parents are: nothing tells their clouds."""
+        if not has_context(self.index.header.attributes):
+            return
+        nodes = nodes[self.index.known[nodes] & self.index.linked[nodes] & (nodes > 0)]
+        while len(lost := nodes[self.absent[self.index.parent[nodes]] & ~self.absent[nodes]]):
+            self.absent[lost] = True
 
     def missing(self, wants: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Split wants into what can be had and is not here.
@@ -121,7 +211,7 @@ class Build:
         """
         known = self.index.known[wants]
         nodes = wants[known]
-        nodes = nodes[~(self.residency.resident[nodes] | self.absent[nodes])]
+        nodes = self._with_ancestors(nodes[~(self.residency.resident[nodes] | self.absent[nodes])])
         pages = self.index.missing_pages(wants[~known]) if not known.all() else np.empty(0, dtype=np.int64)
         here = [page for page in pages.tolist() if page not in self.lost_pages and self.has(self.page_item(page))]
         return np.array(here, dtype=np.int64), nodes

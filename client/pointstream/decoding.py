@@ -11,25 +11,35 @@ from typing import TYPE_CHECKING
 from lpc.codec import decode_cloud
 from lpc.errors import Corrupt
 
+from .lineage import context
+
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from lpc.cloud import Cloud
     from lpc.index import IndexTree
 
 
-def decode_checked(data: bytes, *, node: int, index: IndexTree) -> Cloud:
+def decode_checked(data: bytes, *, node: int, index: IndexTree, family: Mapping[int, Cloud | Corrupt]) -> Cloud:
     """Check the bytes of a cloud against its record and decode them; for any thread.
+
+    `family` holds its nearest ancestors, decoded or damaged.
 
     Raises
     ------
     Corrupt
-        Naming the node.
+        Naming the node; `Untold` if only an ancestor is damaged.
     """
     if zlib.crc32(data) != int(index.crc[node]):
         raise Corrupt(f"cloud {node}: checksum differs, the file or the line damaged it")
+    told_from = context(index, node, family)
     try:
-        return decode_cloud(data, samples=int(index.samples[node]), schema=index.header.attributes)
+        return decode_cloud(
+            data,
+            samples=int(index.samples[node]),
+            schema=index.header.attributes,
+            context=told_from,
+        )
     except Corrupt as error:
         raise Corrupt(f"cloud {node}: {str(error).removeprefix('cloud: ')}") from error
 
@@ -53,21 +63,31 @@ class Decoder:
         self._clock = clock
         self._threads = ThreadPoolExecutor(threads, thread_name_prefix="decode")
 
-    def decode(self, data: bytes, *, node: int, index: IndexTree, done: Callable[[Cloud | Corrupt], None]) -> None:
+    def decode(
+        self,
+        data: bytes,
+        *,
+        node: int,
+        index: IndexTree,
+        family: Mapping[int, Cloud | Corrupt],
+        done: Callable[[Cloud | Corrupt], None],
+    ) -> None:
         """Decode a cloud; `done` is called on the running loop, later, with it or with what is wrong with it."""
         self.backlog += len(data)
         self.pending += 1
-        work = asyncio.get_running_loop().run_in_executor(self._threads, self._timed, data, node, index)
+        work = asyncio.get_running_loop().run_in_executor(self._threads, self._timed, data, node, index, family)
         work.add_done_callback(partial(self._finished, len(data), done))
 
     def close(self) -> None:
         """Drop what waits, finish what is being decoded."""
         self._threads.shutdown(cancel_futures=True)
 
-    def _timed(self, data: bytes, node: int, index: IndexTree) -> tuple[Cloud | Corrupt, float]:
+    def _timed(
+        self, data: bytes, node: int, index: IndexTree, family: Mapping[int, Cloud | Corrupt]
+    ) -> tuple[Cloud | Corrupt, float]:
         start = self._clock()
         try:
-            cloud: Cloud | Corrupt = decode_checked(data, node=node, index=index)
+            cloud: Cloud | Corrupt = decode_checked(data, node=node, index=index, family=family)
         except Corrupt as error:
             cloud = error
         return cloud, self._clock() - start

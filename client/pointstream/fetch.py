@@ -19,6 +19,7 @@ from lpc.header import HEADER_PROBE, Header, compute_digest, parse_header
 from lpc.page import PAGE_HEADER
 from lpc.ranges import ByteRange
 
+from .lineage import Untold
 from .reading import EVERYTHING, Reader, ReadingOptions, Region
 from .stores.cached import CachedStore
 from .stores.sparse import SparseFile, map_path
@@ -101,6 +102,7 @@ class Copy:
         self.path = path
         self._most_bytes = most_bytes
         self._file: SparseFile | None = None
+        self.before: int | None = None  # bytes that it held when it was opened
 
     def __str__(self) -> str:
         return str(self.path)
@@ -135,6 +137,8 @@ class Copy:
         if there is None and self.path.exists() and not map_path(self.path).is_file():
             raise StoreError(f"{self.path} is something else: move it away, or name another folder")
         self._file = SparseFile(self.path, length=header.bytes, tag=header.tag)
+        if self.before is None:
+            self.before = self._file.present.total
         return self._file
 
     def room(self, keep: Path, size: int) -> int:
@@ -188,9 +192,10 @@ async def fetch(
         If the host fails for longer than the patience or the file cannot be written; what came stays.
     """
     options = options or FetchOptions()
-    filled = CachedStore(store, Copy(out, options.most_bytes))
+    place = Copy(out, options.most_bytes)
+    filled = CachedStore(store, place)
     try:
-        fetching = _Fetching(filled, out, options)
+        fetching = _Fetching(filled, place, options)
         return await fetching.run(begin)
     finally:
         await filled.close()
@@ -199,8 +204,8 @@ async def fetch(
 class _Fetching:
     """One run."""
 
-    def __init__(self, store: CachedStore, out: Path, options: FetchOptions) -> None:
-        self.store, self.out, self.options = store, out, options
+    def __init__(self, store: CachedStore, place: Copy, options: FetchOptions) -> None:
+        self.store, self.place, self.out, self.options = store, place, place.path, options
         self.problems: dict[int, str] = {}
         self.reader: Reader
 
@@ -216,8 +221,7 @@ class _Fetching:
         await self.store.flush()
         nodes = self._within_budget(nodes)
         missing = self._missing(nodes)
-        size = int(self.reader.index.size[missing].sum())
-        advance = begin(size)
+        advance = begin(int(self.reader.index.size[missing].sum()))
         await self._waiting_for_host(lambda: self._bring(nodes, advance))
         await self.store.flush()
         self._check_disk()
@@ -226,7 +230,7 @@ class _Fetching:
             await self._bring(nodes, advance)
             await self.store.flush()
             self._check_disk()
-        return self._report(nodes, size)
+        return self._report()
 
     def _check_least(self) -> None:
         index, most = self.reader.index, self.options.most_bytes
@@ -259,7 +263,7 @@ class _Fetching:
         index = self.reader.index
         async for node, cloud in self.reader.clouds(self._missing(nodes)):
             advance(int(index.size[node]))
-            if isinstance(cloud, Corrupt):
+            if isinstance(cloud, Corrupt) and not isinstance(cloud, Untold):
                 self.problems[node] = str(cloud)
             if self.store.waiting > WAITING:
                 await self.store.flush()
@@ -306,9 +310,8 @@ class _Fetching:
         if compute_digest(index.header, records) != index.header.digest:
             raise Corrupt(f"{self.store.name}: its index is not that of its build id: ask its publisher for it anew")
 
-    def _report(self, nodes: NDArray[np.int64], size: int) -> FetchReport:
+    def _report(self) -> FetchReport:
         index = self.reader.index
-        left = int(index.size[self._missing(nodes)].sum())
         known = np.flatnonzero(index.known)
         held = self.store.holds(index.offset[known], index.offset[known] + index.size[known])
         whole = bool(self.store.holds(*_ends(ByteRange(0, index.header.bytes)))[0])
@@ -318,7 +321,7 @@ class _Fetching:
             clouds_total=index.header.nodes,
             bytes=self.store.held_bytes,
             bytes_total=index.header.bytes,
-            bytes_fetched=size - left,
+            bytes_fetched=self.store.held_bytes - (self.place.before or 0),
             complete=whole,
             cut_short=not self.reader.complete,
             problems=tuple(f"{text}; it is missing in the copy" for text in self.problems.values()),

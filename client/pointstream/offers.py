@@ -54,13 +54,16 @@ class Offer:
     ----------
     keys, starts, stops : ndarray, (n,) int64
         Most urgent first, each once, and where it stands in the file.
+    alone : frozenset of int
+        Keys around which no request grows.
     """
 
-    def __init__(self, keys: Keys, starts: Keys, stops: Keys) -> None:
+    def __init__(self, keys: Keys, starts: Keys, stops: Keys, *, alone: frozenset[int] = frozenset()) -> None:
         place = np.argsort(starts, kind="stable")
         self._key, self._start, self._stop = keys[place], starts[place], stops[place]
         self._by_rank = np.argsort(place, kind="stable")
         self._free = np.ones(len(place), dtype=bool)
+        self._alone = alone
         self._cursor = 0
 
     @classmethod
@@ -103,6 +106,8 @@ class Offer:
         """
         first = last = seed
         start, stop = int(self._start[seed]), int(self._stop[seed])
+        if self._alone and int(self._key[seed]) in self._alone:
+            return first, last
         while last + 1 < len(self._free) and self._free[last + 1]:
             near, far = int(self._start[last + 1]), int(self._stop[last + 1])
             if near - stop > gap or far - start > longest:

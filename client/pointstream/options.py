@@ -19,6 +19,9 @@ class LayerOptions:
     decode_threads : int
     decode_backlog : int
         Bytes that have arrived and wait to be decoded, at most, before more are asked for.
+    most_orphans : int
+        Bytes of clouds that have arrived before their ancestors, at most, before those whose ancestors are not on their
+        way are let go.
     tries : int
         Fetches of a cloud or page that fails its checks, before it stays missing.
     scheduler : SchedulerOptions
@@ -28,6 +31,7 @@ class LayerOptions:
     capacity: int = 512 << 20
     decode_threads: int = 2
     decode_backlog: int = 1 << 20
+    most_orphans: int = 4 << 20
     tries: int = 3
     scheduler: SchedulerOptions = field(default_factory=SchedulerOptions)
     recovery: RecoveryOptions = field(default_factory=RecoveryOptions)

@@ -7,19 +7,22 @@ memory holds a few runs whatever the size of the model.
 from __future__ import annotations
 
 import asyncio
-from collections import deque
+from collections import ChainMap, deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import compress
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lpc.context import has_context
 from lpc.errors import Corrupt, ModelChanged
 from lpc.page import page_bytes
 from lpc.ranges import ByteRange, coalesce
 
 from .decoding import decode_checked
+from .lineage import Family, Lineage, Untold, ancestors
 from .opening import add_page, open_index
 
 if TYPE_CHECKING:
@@ -47,6 +50,8 @@ class ReadingOptions:
         That decode.
     tries : int
         Fetches of something that fails its checks.
+    family_bytes : int
+        Decoded clouds to keep, because others are told from them.
     """
 
     max_gap: int = 4096
@@ -54,6 +59,7 @@ class ReadingOptions:
     parallel: int = 4
     threads: int = 2
     tries: int = 3
+    family_bytes: int = 1 << 27
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,7 +186,18 @@ class Reader:
             nodes = await self._descend(region, most_bytes)
             if region.spacing is None or int(index.page_loaded.sum()) == loaded:
                 break  # pages of uneven cells tell how coarse the nodes above them are
-        return nodes[self.reaches(index.offset[nodes], index.offset[nodes] + index.size[nodes])]
+        nodes = nodes[self._there(nodes)]
+        if self.store.partial and has_context(index.header.attributes):  # nor what is told from those
+            here = np.zeros(len(index), dtype=bool)
+            here[nodes] = True
+            while not (told := here[index.parent[nodes]] | (nodes == 0)).all():
+                here[nodes[~told]] = False
+                nodes = nodes[told]
+        return nodes
+
+    def _there(self, nodes: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which clouds are there."""
+        return self.reaches(self.index.offset[nodes], self.index.offset[nodes] + self.index.size[nodes])
 
     async def _descend(self, region: Region, most_bytes: int | None) -> NDArray[np.int64]:
         """Go down the tree by what its pages say now; return nodes in order."""
@@ -206,8 +223,8 @@ class Reader:
         """
         with suppress(Corrupt):
             await self.select()
-        index = self.index
-        return np.flatnonzero(index.known & self.reaches(index.offset, index.offset + index.size))
+        nodes = np.flatnonzero(self.index.known)
+        return nodes[self._there(nodes)]
 
     async def load_pages(self, nodes: NDArray[np.int64]) -> None:
         """Read the pages of these nodes, as far as the file reaches.
@@ -232,6 +249,8 @@ class Reader:
     async def clouds(self, nodes: NDArray[np.int64]) -> AsyncIterator[tuple[int, Cloud | Corrupt]]:
         """Give the clouds of nodes in file order, each as soon as its turn comes; one that stays damaged as an error.
 
+        A sound cloud that is told from a damaged one is an `Untold`.
+
         Raises
         ------
         StoreError
@@ -240,16 +259,15 @@ class Reader:
         ranges = [self.index.cloud_range(node) for node in nodes.tolist()]
         plan = coalesce(ranges, self.options.max_gap, self.options.max_bytes)
         plan.sort(key=lambda run: run[0].start)
+        lineage = Lineage(self.index, self.options.family_bytes)
         with ThreadPoolExecutor(self.options.threads, thread_name_prefix="decode") as threads:
-            going: deque[asyncio.Task[list[tuple[int, Cloud | Corrupt]]]] = deque()
+            going: deque[asyncio.Task[bytes]] = deque()
             try:
-                for place, members in plan:
-                    going.append(asyncio.create_task(self._run(threads, place, nodes[members].tolist())))
-                    if len(going) >= self.options.parallel:
-                        for pair in await going.popleft():
-                            yield pair
-                while going:
-                    for pair in await going.popleft():
+                for number, (place, members) in enumerate(plan):
+                    for ahead, _ in plan[number + len(going) : number + self.options.parallel]:
+                        going.append(asyncio.create_task(self.read(ahead)))
+                    body = await going.popleft()
+                    for pair in await self._decode_run(threads, lineage, place, body, nodes[members].tolist()):
                         yield pair
             finally:
                 for task in going:
@@ -309,33 +327,57 @@ class Reader:
             add_page(self.index, page, data)
         self.store.vouch(place, data)
 
-    async def _run(
-        self, threads: ThreadPoolExecutor, place: ByteRange, nodes: list[int]
+    async def _decode_run(
+        self, threads: ThreadPoolExecutor, lineage: Lineage, place: ByteRange, body: bytes, nodes: list[int]
     ) -> list[tuple[int, Cloud | Corrupt]]:
-        body = await self.read(place)
+        """Decode the nodes of a run, after those of their ancestors that are not at hand."""
+        family, missing = lineage.family(nodes)
+        gone = ~self._there(np.array(missing, dtype=np.int64))
+        family |= {node: Corrupt(f"cloud {node}: it is not in this copy") for node in compress(missing, gone)}
+        missing = [node for node in missing if node not in family]
+        order = sorted([*nodes, *missing])
+        parts = {node: bytes(place.within(body, self.index.cloud_range(node))) for node in nodes}
+        for start in range(0, len(missing), self.options.parallel):
+            some = missing[start : start + self.options.parallel]
+            bodies = await self._together([self.index.cloud_range(node) for node in some])
+            parts |= dict(zip(some, bodies, strict=True))
         loop = asyncio.get_running_loop()
-        parts = [bytes(place.within(body, self.index.cloud_range(node))) for node in nodes]
-        clouds = await loop.run_in_executor(threads, self._decode, nodes, parts)
-        for number, node in enumerate(nodes):
-            place = self.index.cloud_range(node)
-            for _ in range(self.options.tries - 1):
-                if not isinstance(clouds[number], Corrupt):
-                    break
-                self._reject(place)
-                parts[number] = await self.read(place)
-                clouds[number : number + 1] = await loop.run_in_executor(threads, self._decode, [node], [parts[number]])
-            if not isinstance(clouds[number], Corrupt):
-                self.store.vouch(place, parts[number])
-        return list(zip(nodes, clouds, strict=True))
+        # Those of one run are as a rule no ancestors of each other.
+        apart = not missing and all(int(self.index.parent[node]) < order[0] for node in order)
+        cut = len(order) // 2 if apart and self.options.threads > 1 else 0
+        halves = [half for half in (order[:cut], order[cut:]) if half]
+        for found in await asyncio.gather(
+            *(loop.run_in_executor(threads, self._decode, half, parts, family) for half in halves)
+        ):
+            family |= found
+        for node in order:
+            place, tries = self.index.cloud_range(node), self.options.tries
+            while isinstance(family[node], Corrupt):
+                if isinstance(family[node], Untold):
+                    if any(isinstance(family[above], Corrupt) for above in ancestors(self.index, node)):
+                        break
+                else:
+                    tries -= 1
+                    if tries == 0:
+                        break
+                    self._reject(place)
+                    parts[node] = await self.read(place)
+                family |= await loop.run_in_executor(threads, self._decode, [node], parts, family)
+            if isinstance(family[node], Untold) or not isinstance(family[node], Corrupt):
+                self.store.vouch(place, parts[node])
+        lineage.keep(family)
+        return [(node, family[node]) for node in nodes]
 
-    def _decode(self, nodes: list[int], parts: list[bytes]) -> list[Cloud | Corrupt]:
-        clouds: list[Cloud | Corrupt] = []
-        for node, part in zip(nodes, parts, strict=True):
+    def _decode(self, nodes: list[int], parts: dict[int, bytes], family: Family) -> Family:
+        """Decode nodes, coarse first; `family` has the ancestors that are not among them."""
+        found: Family = {}
+        known = ChainMap(found, family)
+        for node in nodes:
             try:
-                clouds.append(decode_checked(part, node=node, index=self.index))
+                found[node] = decode_checked(parts[node], node=node, index=self.index, family=known)
             except Corrupt as error:
-                clouds.append(error)
-        return clouds
+                found[node] = error
+        return found
 
 
 def _children(index: IndexTree, nodes: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -63,10 +63,9 @@ class Residency:
         """Whether the pinned clouds alone leave less than the slack."""
         return self._pinned_bytes > self.capacity - self.capacity // self._slack
 
-    @property
-    def roomy(self) -> bool:
-        """Whether what comes ahead finds room without pushing anything out: half of what is freed at a time."""
-        return self.bytes <= self.capacity - self.capacity // (2 * self._slack)
+    def roomy(self, coming: int) -> bool:
+        """Whether more finds room ahead after `coming` bytes, pushing nothing out: half of what is freed at a time."""
+        return self.bytes + coming <= self.capacity - self.capacity // (2 * self._slack)
 
     def pin(self, nodes: NDArray[np.int64]) -> list[int]:
         """Make `nodes` the current cut: touched now, not to be dropped until the next call.

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lpc.context import has_context, line_of
 from lpc.errors import Corrupt, FormatError, LpcError, ModelChanged, StoreError, Unavailable
 from lpc.header import HEADER_PROBE
 from lpc.ranges import ByteRange
 
 from .arrivals import Assembly
-from .build import Build
+from .build import Arrived, Build
 from .decoding import Decoder
 from .foresight import Foresight
 from .offers import Item, Request
@@ -120,7 +121,11 @@ class Traffic:
         """
         keys, starts, stops, held = build.places(pages, nodes)
         self.local.offer(keys[held], starts[held], stops[held])
-        self.scheduler.offer(keys[~held], starts[~held], stops[~held])
+        line = 0  # the first want may wait for its ancestors: what these bring along would delay it
+        while line + 1 < len(nodes) and nodes[line] in line_of(int(nodes[line + 1]), build.index.parent):
+            line += 1
+        alone = nodes[: line + 1] if line else None
+        self.scheduler.offer(keys[~held], starts[~held], stops[~held], alone=alone)
         self.issue()
 
     def offer_ahead(self, build: Build, pages: NDArray[np.int64], nodes: NDArray[np.int64]) -> None:
@@ -137,7 +142,7 @@ class Traffic:
             and self.store.meter is not None
             and not self.scheduler.waiting
             and self.build is not None
-            and self.build.residency.roomy
+            and self.build.roomy(self.scheduler.ahead)
         )
 
     def draws(self, build: Build, nodes: NDArray[np.int64]) -> None:
@@ -164,7 +169,7 @@ class Traffic:
             return
         meter = self.store.meter
         link = None if meter is None else LinkState(meter.admission(now), meter.rtt, meter.measured)
-        for request in self.scheduler.issue(now, link, ahead=build.residency.roomy):
+        for request in self.scheduler.issue(now, link, ahead=build.roomy(self.scheduler.ahead)):
             self._spawn(self._fetch(build, request, self.scheduler))
 
     def _spawn(self, work: Coroutine[None, None, None]) -> None:
@@ -221,6 +226,8 @@ class Traffic:
         finally:
             self._probing = False
             scheduler.ended(request)
+            if build is not None:
+                self._forget_orphans(build)
         self.issue()
 
     def _begin(self, opening: Opening, data: bytearray) -> Build:
@@ -270,6 +277,7 @@ class Traffic:
             self._failed(error)
         finally:
             scheduler.ended(request)
+            self._forget_orphans(build)
         self.issue()
 
     def _land(self, scheduler: Scheduler, request: Request, assembly: Assembly, offset: int, chunk: bytes) -> None:
@@ -293,10 +301,34 @@ class Traffic:
                 self._page_arrived(build, ~item.key, data, request, assembly)
             elif not build.residency.resident[item.key] and not build.busy[item.key]:
                 build.busy[item.key] = True
-                done = partial(self._decoded, build, item, data, ahead=request.brings(item) if request.ahead else 0)
-                self.decoder.decode(data, node=item.key, index=build.index, done=done)
+                self._decode(build, Arrived(item, data, request.brings(item) if request.ahead else 0))
         if arrived:
             self.issue()
+
+    def _decode(self, build: Build, came: Arrived) -> None:
+        """Decode a cloud once those that it is told from are here."""
+        family = build.family(came.item.key)
+        if isinstance(family, int):
+            build.wait(came, family)
+            return
+        done = partial(self._decoded, build, came.item, came.data, ahead=came.ahead)
+        self.decoder.decode(came.data, node=came.item.key, index=build.index, family=family, done=done)
+
+    def _go_on(self, build: Build, node: int) -> None:
+        """Decode what waited for a node."""
+        for came in build.release(node):
+            self._decode(build, came)
+
+    def _forget_orphans(self, build: Build) -> None:
+        """Let go of what waits for clouds that never come; if much waits, also for those that are not on their way."""
+        much = build.waiting_bytes > self._options.most_orphans
+        lost = [
+            node
+            for node in build.waiting
+            if build.absent[node]
+            or (much and not (build.busy[node] or self.scheduler.flies(node) or self.local.flies(node)))
+        ]
+        build.forget(lost)
 
     def _page_arrived(self, build: Build, page: int, data: bytes, request: Request, assembly: Assembly) -> None:
         try:
@@ -324,6 +356,7 @@ class Traffic:
             return
         if isinstance(cloud, Corrupt):
             self._damaged(build, item.key, cloud)
+            self._forget_orphans(build)
         else:
             self.payload += len(data) * build.passed(item, data)
             if ahead:
@@ -331,11 +364,14 @@ class Traffic:
             undrawn = ahead > 0 and not self.wanted.holds(item.key)
             self.foresight.dropped(build.add(item.key, cloud, ahead=undrawn))
             self.wanted.came(self._clock(), item.key)
+            self._go_on(build, item.key)
         self.issue()
 
     def _damaged(self, build: Build, key: int, error: FormatError) -> None:
         if build.failed(key, self._options.tries):
-            self.errors.add("page" if key < 0 else "cloud", f"{self.store.name}: {error}; it stays missing")
+            below = key >= 0 and has_context(build.index.header.attributes) and (build.index.children[key] >= 0).any()
+            what = "it stays missing, and what is below it" if below else "it stays missing"
+            self.errors.add("page" if key < 0 else "cloud", f"{self.store.name}: {error}; {what}")
             self.wanted.came(self._clock(), key)
 
     def _failed(self, error: LpcError) -> None:

@@ -16,6 +16,7 @@ from lpc.info import counted
 from lpc.octahedral import max_error_degrees
 from lpc.page import PAGE_HEADER
 
+from .lineage import Untold
 from .matching import Matcher, MatchReport
 
 if TYPE_CHECKING:
@@ -143,9 +144,12 @@ async def verify(
         tempfile.TemporaryDirectory(prefix="pointstream-") as folder,
         Matcher(header, compared, Path(folder)) as matcher,
     ):
-        samples = 0
+        samples = untold = lost = 0
         async for node, cloud in reader.clouds(nodes):
             advance(1)
+            if isinstance(cloud, Untold):
+                untold, lost = untold + 1, lost + int(index.samples[node])
+                continue
             if isinstance(cloud, Corrupt):
                 problems.add(str(cloud))
                 continue
@@ -154,6 +158,11 @@ async def verify(
             _check_node(reader.index, node, points, problems)
             if scans:
                 matcher.add_out(cloud.lattice(), points.attributes)
+        if untold:
+            problems.add(
+                f"{counted(untold, 'sound cloud')} of {counted(lost, 'sample')} cannot be decoded: they are told from "
+                "clouds that are damaged or missing"
+            )
         if complete and samples != header.samples:
             problems.add(f"the clouds hold {samples} samples, the header says {header.samples}")
         matcher.report.not_compared = not_compared

@@ -143,13 +143,15 @@ class Camera:
 
     def rotation(self) -> NDArray[np.float64]:
         """Rows right, up and forward, (3, 3): `rotation() @ (x - eye)` is x in camera space."""
-        eye, target, up = np.array(self.eye), np.array(self.target), np.array(self.up)
-        forward = (target - eye) / np.linalg.norm(target - eye)
-        right = np.cross(forward, up / np.linalg.norm(up))
-        if np.linalg.norm(right) < 1e-9:
-            right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
-        right /= np.linalg.norm(right)
-        return np.stack([right, np.cross(right, forward), forward])
+        # Of three numbers Python is quicker than numpy.
+        (x, y, z), (eye_x, eye_y, eye_z) = self.target, self.eye
+        forward = _unit((x - eye_x, y - eye_y, z - eye_z))
+        right = _cross(forward, _unit(self.up))
+        if math.hypot(*right) < 1e-9:
+            least = min(range(3), key=lambda axis: abs(forward[axis]))
+            right = _cross(forward, (float(least == 0), float(least == 1), float(least == 2)))
+        right = _unit(right)
+        return np.array([right, _cross(right, forward), forward])
 
     def to_camera(self, points: ArrayLike) -> NDArray[np.float64]:
         """Points of model space (n, 3) in camera space: right, up, depth."""
@@ -202,6 +204,16 @@ class Camera:
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _unit(vector: Vector) -> Vector:
+    x, y, z = vector
+    length = math.hypot(x, y, z)
+    return x / length, y / length, z / length
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 def _vector(values: NDArray[np.float64]) -> Vector:

@@ -42,10 +42,16 @@ class Places:
     spacing : (n + m, 2) float32
         Spacing to close in each half, model units; the largest of it where a link goes deeper. Negative in a half
         that ends here because its node is missing.
+    spread : (n + m,) float32
+        How much further apart samples are where a half of the row ends than all of the model's would be.
+    alone : (n,) float32
+        The inverse of that for the samples of the node alone: `render.thin` knows how far apart these are.
     corner : (n, 3) float64
         Lowest corner of the node's cell, model space.
     level : (n,) int32
-        Of the node; -1 where both halves end here with one spacing, so that nothing need be looked up.
+        Of the node.
+    uniform : (n,) bool
+        Whether both halves end here with one spacing, so that nothing need be looked up.
     axis : (levels,) int32
         Axis along which the cells of a level are halved.
     half : (levels,) float32
@@ -54,8 +60,11 @@ class Places:
 
     link: NDArray[np.int32]
     spacing: NDArray[np.float32]
+    spread: NDArray[np.float32]
+    alone: NDArray[np.float32]
     corner: NDArray[np.float64]
     level: NDArray[np.int32]
+    uniform: NDArray[np.bool_]
     axis: NDArray[np.int32]
     half: NDArray[np.float32]
 
@@ -83,49 +92,54 @@ def halvings(header: Header, levels: int) -> tuple[NDArray[np.int32], NDArray[np
 
 def places(
     header: Header,
-    drawn: Sequence[NDArray[np.bool_]],
-    missing: Sequence[NDArray[np.bool_]],
-    own: Sequence[NDArray[np.float64]],
-    shown: Sequence[NDArray[np.float64]],
+    starts: Sequence[int],
+    drawn: NDArray[np.bool_],
+    missing: NDArray[np.bool_],
+    own: NDArray[np.float64],
+    shown: NDArray[np.float64],
     below: Below,
+    alone: NDArray[np.float64],
 ) -> Places:
-    """Lay out the drawn nodes, level by level.
+    """Lay out the drawn nodes.
 
     Parameters
     ----------
-    drawn, missing : sequence of (n, 2) bool
-        For each node of a level, which children are drawn and which are missing.
-    own, shown : sequence of (n,) float64
+    starts : sequence of int
+        Where the nodes of each level start, and where the last ends.
+    drawn, missing : (n, 2) bool
+        For each node, which children are drawn and which are missing.
+    own, shown : (n,) float64
         The spacing that each node's own samples close (`snug`), and the largest shown around its samples.
     below : Below
         What the index says of the halves without a drawn node.
+    alone : (n,) float64
+        See `Places`.
     """
-    axes, halves = halvings(header, len(drawn) + below.levels)
-    corner = np.array([header.bounds[:3]], dtype=np.float64)
-    links, spacings, corners, levels, row = [], [], [], [], 0
-    for depth, (goes_on, ends) in enumerate(zip(drawn, missing, strict=True)):
-        here = slice(row, row + len(goes_on))
-        row += len(goes_on)
-        children = int(np.count_nonzero(goes_on))
-        link = below.link[here].copy()
-        link[goes_on] = np.arange(row, row + children)
-        spacing = np.where(ends, -own[depth][:, None], shown[depth][:, None])
-        spacing = np.where(np.isnan(below.spacing[here]), spacing, below.spacing[here])
-        if children:
-            spacing[goes_on] = shown[depth + 1]
-        uniform = (link < 0).all(axis=1) & (spacing[:, 0] == spacing[:, 1])
-        links.append(link)
-        spacings.append(spacing)
-        corners.append(corner)
-        levels.append(np.where(uniform, -1, depth))
-        lower = np.repeat(corner, 2, axis=0).reshape(-1, 2, 3)
-        lower[:, 1, axes[depth]] += halves[depth]
-        corner = lower[goes_on]
+    count, levels = len(drawn), len(starts) - 1
+    axes, halves = halvings(header, levels + below.levels)
+    link, spacing = below.link.copy(), below.spacing.copy()
+    link[:count][drawn] = np.arange(1, count)  # nodes stand in the order of the halves that hold them
+    here = np.where(missing, -own[:, None], shown[:, None])
+    here = np.where(np.isnan(spacing[:count]), here, spacing[:count])
+    here[drawn] = shown[1:]
+    spacing[:count] = here
+    uniform = (link[:count, 0] < 0) & (link[:count, 1] < 0) & (here[:, 0] == here[:, 1])
+    parent, half = np.nonzero(drawn)
+    corner = np.empty((count, 3))
+    corner[0] = header.bounds[:3]
+    for depth in range(1, levels):
+        some = slice(starts[depth], starts[depth + 1])
+        above = slice(some.start - 1, some.stop - 1)  # the root has no parent
+        corner[some] = corner[parent[above]]
+        corner[some, axes[depth - 1]] += half[above] * halves[depth - 1]
     return Places(
-        link=np.concatenate([*links, below.link[row:]]),
-        spacing=np.concatenate([*spacings, below.spacing[row:]]).astype(np.float32),
-        corner=np.concatenate(corners),
-        level=np.concatenate(levels).astype(np.int32),
+        link=link,
+        spacing=spacing.astype(np.float32),
+        spread=below.spread.astype(np.float32),
+        alone=alone.astype(np.float32),
+        corner=corner,
+        level=np.repeat(np.arange(levels, dtype=np.int32), np.diff(starts)),
+        uniform=uniform,
         axis=axes,
         half=halves.astype(np.float32),
     )

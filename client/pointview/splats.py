@@ -37,9 +37,16 @@ LARGEST = 160.0
 """No splat has a larger side, pixels: its disc stays within 255, the least that OpenGL implementations allow, even
 where the perspective stretches it at the rim of the picture."""
 
-HOLE = 1.5
+HOLE = 1.0
 """Widest half of a gap that is taken for a hole of the sampling, sides of the splats around it. Random samples leave
 one gap or other at any density, and no scan is evenly dense; what fits into such a gap is no detail of the model."""
+
+FACES = 5
+"""Directions, of eight, in which the wall around a hole must go on into it: its plane reaches the hole within `HOLE`
+too. The surface falls away behind a silhouette, so what lies between silhouettes, near as they are, stays open."""
+
+FACE = 0.25
+"""Over what length the slope of such a wall is measured, sides of its splat: one disc has one slope."""
 
 REACH = 1.0
 """A sample this near to a coarser cell, in spacings of that cell, helps to close it (`places`)."""

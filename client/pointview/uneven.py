@@ -35,12 +35,15 @@ class Below:
     spacing : (n + m, 2) float64
         Spacing that a half shows, model units; the largest of it where a link goes deeper. Negative where a node is
         missing. NaN: the index knows nothing better than the node above.
+    spread : (n + m,) float64
+        How much further apart samples are there than all of the model's would be.
     levels : int
         How far the added rows go down.
     """
 
     link: NDArray[np.int32]
     spacing: NDArray[np.float64]
+    spread: NDArray[np.float64]
     levels: int
 
 
@@ -60,13 +63,14 @@ def look_below(
         Which of their children are drawn, and which should be.
     """
     density, eye = index.density, np.array(camera.eye)
+    spreads = [1.0 / np.sqrt(density.drawn[nodes])]
     link, spacing = np.full(drawn.shape, -1, dtype=np.int32), np.full(drawn.shape, np.nan)
     uneven = np.flatnonzero(density.uneven[nodes])
     children = np.where(drawn[uneven], -1, index.children[nodes[uneven]])
     at, half = np.nonzero((children >= 0) & index.known[children])
     # Cells of one level: the row and half they belong to, and what spreads their samples.
     row, cell = uneven[at], children[at, half].astype(np.int64)
-    spread = np.where(missing[row, half], -1.0, 1.0) / np.sqrt(density.drawn[nodes[row]])
+    spread = np.where(missing[row, half], -1.0, 1.0) * spreads[0][row]
     hung = []
     while len(cell):
         apart = density.full[cell] * spread
@@ -79,10 +83,11 @@ def look_below(
         hung.append((first, row, half))
         link = np.concatenate([link, np.full((len(row), 2), -1, dtype=np.int32)])
         spacing = np.concatenate([spacing, np.stack([apart, apart], axis=1)])
+        spreads.append(np.abs(spread))
         children = index.children[cell]
         at, half = np.nonzero((children >= 0) & index.known[children])
         row, cell, spread = first + at, children[at, half].astype(np.int64), spread[at]
     for first, row, half in reversed(hung):
         largest = np.abs(spacing[first : first + len(row)]).max(axis=1)
         spacing[row, half] = np.copysign(largest, spacing[row, half])
-    return Below(link, spacing, len(hung))
+    return Below(link, spacing, np.concatenate(spreads), len(hung))

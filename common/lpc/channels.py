@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from .attributes import Attribute, Schema
+    from .cloud import Cloud
 
 WIDE = 32
 """Bits of the widest channel; scalars above it are cut into a high and a low part."""
@@ -35,6 +36,8 @@ class Channels:
         What predicts a sample that has no predecessor.
     normals : ndarray, (m, 2) int64
         For each normal its first row and M = 2**(bits - 1) - 1, the code of the centre.
+    guessed : ndarray, (g, 3) int64
+        Normals and colours, which a context can tell: first row, 1 for a normal or 0, bits of the attribute.
     groups : tuple of (int, int)
         Half-open runs of channels that share statistics, so that one zstd block serves a run best.
     """
@@ -42,15 +45,16 @@ class Channels:
     bits: NDArray[np.int64]
     start: NDArray[np.uint32]
     normals: NDArray[np.int64]
+    guessed: NDArray[np.int64]
     groups: tuple[tuple[int, int], ...]
 
     def __len__(self) -> int:
         return len(self.bits)
 
     @property
-    def normal_rows(self) -> NDArray[np.int64]:
-        """Rows of the normals, (2 m,)."""
-        return (self.normals[:, :1] + (0, 1)).ravel()
+    def guessed_rows(self) -> list[int]:
+        """Rows of normals and colours."""
+        return [first + i for first, normal, _ in self.guessed.tolist() for i in range(2 if normal else 3)]
 
 
 def _shape(attribute: Attribute) -> tuple[list[int], int, list[int]]:
@@ -71,6 +75,7 @@ def channels_of(schema: Schema) -> Channels:
     bits: list[int] = []
     start: list[int] = []
     normals: list[tuple[int, int]] = []
+    guessed: list[tuple[int, int, int]] = []
     groups: list[tuple[int, int]] = []
     for attribute in schema:
         widths, first, runs = _shape(attribute)
@@ -79,12 +84,15 @@ def channels_of(schema: Schema) -> Channels:
             groups.append((end, end + run))
         if attribute.kind == "normal":
             normals.append((len(bits), first))
+        if attribute.kind != "scalar":
+            guessed.append((len(bits), attribute.kind == "normal", attribute.bits))
         bits += widths
         start += [first] * len(widths)
     return Channels(
         bits=np.array(bits, np.int64),
         start=np.array(start, np.uint32),
         normals=np.array(normals, np.int64).reshape(-1, 2),
+        guessed=np.array(guessed, np.int64).reshape(-1, 3),
         groups=tuple(groups),
     )
 
@@ -134,6 +142,20 @@ def to_channels(codes: Mapping[str, NDArray[Any]], schema: Schema, samples: int)
             rows[at] = values
             at += 1
     return rows
+
+
+def rows_of(members: Sequence[tuple[Cloud, NDArray[np.intp]]], schema: Schema) -> NDArray[np.uint32]:
+    """Rows of the normals and colours of some samples of some clouds, (g, n)."""
+    rows: list[NDArray[Any]] = []
+    for attribute in schema:
+        if attribute.kind != "scalar":
+            parts: list[list[NDArray[Any]]] = [[np.empty(0, attribute.code_dtype)] for _ in range(attribute.components)]
+            for cloud, index in members:
+                for column, part in zip(cloud.codes[attribute.name].T, parts, strict=True):
+                    part.append(column.take(index))
+            values = [np.concatenate(part) for part in parts]
+            rows += values if attribute.kind == "normal" else [*_ycocg(np.stack(values, axis=1), attribute.bits)]
+    return np.array(rows).astype(np.uint32)
 
 
 def from_channels(rows: NDArray[np.uint32], schema: Schema) -> dict[str, NDArray[Any]]:

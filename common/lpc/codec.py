@@ -7,9 +7,7 @@ before anything is allocated, and only `Corrupt` comes out of a bad one.
 from __future__ import annotations
 
 import itertools
-import math
 import threading
-from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Literal, Protocol
@@ -19,15 +17,19 @@ import zstandard
 
 from .channels import Channels, channels_of, from_channels, to_channels
 from .cloud import Cloud
+from .context import Near, Part, Place, line_of, select
 from .errors import Corrupt
 from .lattice import dequantise
 from .octahedral import decode_normals
 from .payload import (
+    CONTEXT,
     MAX_SAMPLES,
+    MAX_SHIFT,
     ORIGIN_LIMIT,
-    RAW_BITS,
+    TOP_BITS,
     Layout,
     Packed,
+    Placed,
     Unpacked,
     largest_payload,
     pack_header,
@@ -36,7 +38,7 @@ from .payload import (
 from .points import PointBatch
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -47,30 +49,8 @@ Effort = Literal["default", "best", "fast"]
 Engine = Literal["auto", "numpy", "compiled"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Limits:
-    """What an effort spends on a cloud.
-
-    Parameters
-    ----------
-    window : int
-        Previous samples that predict an attribute: with 16 a cloud takes 0.8 % more and decodes 1.7 times as fast.
-    hard : float
-        Bits a sample of position and normal above which planes are tried.
-    gain : float
-        Bits a sample that planes must save to be kept: a cloud with planes takes twice as long to decode.
-    """
-
-    window: int
-    hard: float
-    gain: float
-
-
-LIMITS: dict[Effort, _Limits] = {
-    "default": _Limits(window=64, hard=20.5, gain=0.25),
-    "best": _Limits(window=64, hard=0.0, gain=0.0),
-    "fast": _Limits(window=16, hard=math.inf, gain=0.0),
-}
+WINDOWS: dict[Effort, int] = {"default": 64, "best": 64, "fast": 16}
+"""Previous samples that predict what no context tells."""
 
 SMALL = 1024
 """Samples of a cloud whose blocks zstd takes for small."""
@@ -82,18 +62,27 @@ MAX_FRAME_WINDOW = 1 << 27
 class _Codec(Protocol):
     """What `codec_numpy` and `codec_compiled` both are."""
 
-    def encode(
+    def arrange(self, lattice: NDArray[np.int64], rows: NDArray[np.uint32], begin: int, end: int) -> Placed: ...
+
+    def pack(
         self,
+        placed: Placed,
         lattice: NDArray[np.int64],
         rows: NDArray[np.uint32],
-        begin: int,
-        end: int,
         channels: Channels,
         window: int,
-        planes: bool = False,
+        near: Near | None,
     ) -> Packed: ...
 
     def decode(self, payload: bytes, layout: Layout, channels: Channels) -> Unpacked: ...
+
+    def add_guesses(
+        self, position: NDArray[np.uint16], rows: NDArray[np.uint32], near: Near, channels: Channels, nbits: int
+    ) -> None: ...
+
+    def box(self, position: NDArray[np.uint16]) -> tuple[Place, Place]: ...
+
+    def take(self, parts: Sequence[Part], schema: Schema) -> Near: ...
 
     def turn_back(self, rows: NDArray[np.uint32], channels: Channels, turn: int) -> None: ...
 
@@ -145,6 +134,7 @@ def encode_cloud(
     codes: Mapping[str, NDArray[Any]],
     schema: Schema,
     *,
+    context: Sequence[Cloud] = (),
     effort: Effort = "default",
     engine: Engine = "auto",
 ) -> bytes:
@@ -158,12 +148,11 @@ def encode_cloud(
         Codes by attribute name: normals (k, 2), colours (k, 3), scalars (k,).
     schema : Schema
         The attributes that are written, in that order.
+    context : sequence of Cloud
+        The node's ancestors as they are decoded, from the root down; the last `ANCESTORS` of them count.
     effort : {"default", "best", "fast"}
-        Normals predicted by planes take about 0.7 bits a sample less, but such a cloud takes twice as long to decode
-        and four times as long to encode. "best" tries planes on every cloud and lets zstd search longer. "default"
-        tries them where position and normal take more than 20.5 bits a sample, and keeps them where they save 0.25.
-        "fast" never tries them, looks at fewer neighbours and lets zstd search less (docs/format.md, Choices of a
-        writer).
+        "best" lets zstd search longer; "fast" looks at fewer previous samples and lets zstd search less
+            (docs/format.md, Choices of a writer).
 
     Returns
     -------
@@ -175,7 +164,8 @@ def encode_cloud(
     ValueError
         If arguments are out of these ranges.
     """
-    return encode_clouds(lattice, codes, np.array([0, len(lattice)]), schema, effort=effort, engine=engine)[0]
+    writer = CloudWriter(lattice, codes, np.array([0, len(lattice)]), schema, effort=effort, engine=engine)
+    return writer.frame(writer.place(0), context)
 
 
 def encode_clouds(
@@ -184,65 +174,115 @@ def encode_clouds(
     bounds: NDArray[np.int64],
     schema: Schema,
     *,
+    parent: NDArray[np.int64] | None = None,
     effort: Effort = "default",
     engine: Engine = "auto",
 ) -> list[bytes]:
     """Pack many clouds that stand one after another: cloud `i` is samples ``bounds[i]`` to ``bounds[i + 1]``.
 
     The same frames as one call of `encode_cloud` each, for less: what numpy does is done once.
+
+    Parameters
+    ----------
+    parent : ndarray, (n,) int64, optional
+        Number of each cloud's parent among these, always a smaller one; -1 for none.
     """
-    channels = channels_of(schema)
-    lattice = np.ascontiguousarray(lattice, np.int64)
-    edges = np.asarray(bounds).tolist()
-    for begin, end in itertools.pairwise(edges):
-        if not 1 <= end - begin <= MAX_SAMPLES or not 0 <= begin < end <= len(lattice):
-            raise ValueError(f"a cloud of samples {begin} to {end} of {len(lattice)}: 1 to {MAX_SAMPLES} are allowed")
-    if len(lattice) and (lattice.min() <= -ORIGIN_LIMIT or lattice.max() >= ORIGIN_LIMIT):
-        raise ValueError("lattice coordinates must stay below 2**52")
-    rows = to_channels(codes, schema, len(lattice))
-    encode = _codec(engine).encode
-    limits = LIMITS[effort]
-    compressor = _contexts.compressor(effort)
-    # Faster strategies reuse another stream's Huffman codes in blocks up to 1 KiB, which takes up to 20 % more.
-    small = _contexts.compressor("default" if effort == "fast" else effort)
+    writer = CloudWriter(lattice, codes, bounds, schema, effort=effort, engine=engine)
+    above = [-1] * (len(bounds) - 1) if parent is None else parent.tolist()
+    inner = set(above)
+    clouds: dict[int, Cloud] = {}
     frames = []
-    for begin, end in itertools.pairwise(edges):
-        chosen = small if end - begin <= SMALL else compressor
-        frame, bits = _frame(encode(lattice, rows, begin, end, channels, limits.window), channels, chosen)
-        if len(channels.normals) and bits > limits.hard * (end - begin):
-            packed = encode(lattice, rows, begin, end, channels, limits.window, planes=True)
-            if packed.grid:
-                other, _ = _frame(packed, channels, chosen)
-                if 8 * (len(frame) - len(other)) > limits.gain * (end - begin):
-                    frame = other
-        frames.append(frame)
+    for number in range(len(above)):
+        placed = writer.place(number)
+        frames.append(writer.frame(placed, [clouds[up] for up in line_of(number, above)]))
+        if number in inner:
+            clouds[number] = writer.cloud(placed)
     return frames
 
 
-def _frame(packed: Packed, channels: Channels, compressor: zstandard.ZstdCompressor) -> tuple[bytes, int]:
-    """Compress a payload with a block for each kind of number, so that each has Huffman codes of its own.
+class CloudWriter:
+    """Encodes clouds that stand one after another, in any order; for one thread.
 
-    Returns the frame, and the bits of it that are not other channels than normals.
+    Parameters
+    ----------
+    lattice, codes, bounds, schema, effort, engine
+        As of `encode_clouds`.
     """
-    if packed.nbits > 16 or packed.shift > 32:
-        raise ValueError(f"a cloud spans 2**{packed.nbits + packed.shift} steps, 2**48 are the most")
+
+    def __init__(
+        self,
+        lattice: NDArray[np.int64],
+        codes: Mapping[str, NDArray[Any]],
+        bounds: NDArray[np.int64],
+        schema: Schema,
+        *,
+        effort: Effort = "default",
+        engine: Engine = "auto",
+    ) -> None:
+        lattice = np.ascontiguousarray(lattice, np.int64)
+        self._bounds = np.asarray(bounds).tolist()
+        for begin, end in itertools.pairwise(self._bounds):
+            if not 1 <= end - begin <= MAX_SAMPLES or not 0 <= begin < end <= len(lattice):
+                raise ValueError(
+                    f"a cloud of samples {begin} to {end} of {len(lattice)}: 1 to {MAX_SAMPLES} are allowed"
+                )
+        if len(lattice) and (lattice.min() <= -ORIGIN_LIMIT or lattice.max() >= ORIGIN_LIMIT):
+            raise ValueError("lattice coordinates must stay below 2**52")
+        self._codes, self._schema = codes, schema
+        self._lattice, self._rows = lattice, to_channels(codes, schema, len(lattice))
+        self._channels, self._codec = channels_of(schema), _codec(engine)
+        self._window, self._compressor = WINDOWS[effort], _contexts.compressor(effort)
+        # Faster strategies reuse another stream's Huffman codes in blocks up to 1 KiB, which takes up to 20 % more.
+        self._small = _contexts.compressor("default" if effort == "fast" else effort)
+
+    def place(self, number: int) -> Placed:
+        """Put the samples of a cloud in order."""
+        placed = self._codec.arrange(self._lattice, self._rows, self._bounds[number], self._bounds[number + 1])
+        if placed.nbits > TOP_BITS or placed.shift > MAX_SHIFT:
+            raise ValueError(f"a cloud spans 2**{placed.nbits + placed.shift} steps, 2**48 are the most")
+        return placed
+
+    def cloud(self, placed: Placed) -> Cloud:
+        """Give a cloud as context of others, as it will be decoded: with normals and colours only."""
+        low = None
+        if placed.shift:
+            low = ((self._lattice[placed.order] - placed.corner) & ((1 << placed.shift) - 1)).astype(np.uint32)
+        codes = {item.name: self._codes[item.name][placed.order] for item in self._schema if item.kind != "scalar"}
+        return Cloud(origin=placed.corner, position=placed.position, shift=placed.shift, low=low, codes=codes)
+
+    def frame(self, placed: Placed, context: Sequence[Cloud]) -> bytes:
+        """Encode a cloud; `context` as of `encode_cloud`."""
+        near = None
+        if context and len(self._channels.guessed):
+            x, y, z = placed.corner.tolist()
+            near = select(
+                context,
+                self._schema,
+                corner=(x, y, z),
+                shift=placed.shift,
+                position=placed.position,
+                engine=self._codec,
+            )
+            near = near if near.rows.shape[1] else None
+        packed = self._codec.pack(placed, self._lattice, self._rows, self._channels, self._window, near)
+        small = len(placed.position) <= SMALL
+        return _frame(packed, self._channels, self._small if small else self._compressor)
+
+
+def _frame(packed: Packed, channels: Channels, compressor: zstandard.ZstdCompressor) -> bytes:
+    """Compress a payload with a block for each kind of number, so that each has Huffman codes of its own."""
     head = pack_header(packed) + packed.raw.tobytes()
     stream = compressor.compressobj(size=len(head) + packed.tokens.size)
     parts = [stream.compress(head) + stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)]
-    runs = ((-1, 0), *channels.groups)
-    normal = {first for first, _ in channels.normals.tolist()} | {-1}
-    others = 0
-    for first, stop in runs:
-        tokens = packed.tokens[1 + first : 1 + stop]
+    for first, stop in ((-1, 0), *channels.groups):
         end = zstandard.COMPRESSOBJ_FLUSH_FINISH if stop == len(channels) else zstandard.COMPRESSOBJ_FLUSH_BLOCK
-        parts.append(stream.compress(tokens.data) + stream.flush(end))
-        if first not in normal:
-            others += 8 * len(parts[-1]) + int(RAW_BITS[tokens].sum(dtype=np.int64))
-    frame = b"".join(parts)
-    return frame, 8 * len(frame) - others
+        parts.append(stream.compress(packed.tokens[1 + first : 1 + stop].data) + stream.flush(end))
+    return b"".join(parts)
 
 
-def decode_cloud(frame: bytes, *, samples: int, schema: Schema, engine: Engine = "auto") -> Cloud:
+def decode_cloud(
+    frame: bytes, *, samples: int, schema: Schema, context: Sequence[Cloud] = (), engine: Engine = "auto"
+) -> Cloud:
     """Unpack a cloud.
 
     Parameters
@@ -253,6 +293,8 @@ def decode_cloud(frame: bytes, *, samples: int, schema: Schema, engine: Engine =
         How many samples the node's record promises.
     schema : Schema
         The header's attributes.
+    context : sequence of Cloud
+        The node's ancestors, decoded, from the root down: the last `ANCESTORS` of them, or all there are.
     engine : {"auto", "numpy", "compiled"}
         "auto" takes the compiled kernels if numba is installed. The arrays are the same.
 
@@ -270,10 +312,20 @@ def decode_cloud(frame: bytes, *, samples: int, schema: Schema, engine: Engine =
     unpacked = codec.decode(payload, layout, channels)
     if unpacked.largest >> (3 * layout.nbits):
         raise Corrupt(f"cloud: its positions leave {layout.nbits} bits")
+    if layout.turn == CONTEXT:
+        near = select(
+            context,
+            schema,
+            corner=layout.origin,
+            shift=layout.shift,
+            position=unpacked.position,
+            engine=codec,
+        )
+        codec.add_guesses(unpacked.position, unpacked.rows, near, channels, layout.nbits)
     for first, centre in channels.normals.tolist():
         if unpacked.rows[first : first + 2].max() > 2 * centre:
             raise Corrupt("cloud: a code is no normal's")
-    if layout.turn:
+    if 0 < layout.turn < CONTEXT:
         codec.turn_back(unpacked.rows, channels, layout.turn)
     return Cloud(
         origin=np.array(layout.origin, np.int64),

@@ -11,14 +11,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba import njit
 
-from .normals_compiled import best_planes, best_turn, from_planes
+from .guess_compiled import add_guesses as add_guesses
+from .guess_compiled import box as box
+from .guess_compiled import take as take
+from .guess_compiled import without_guesses
+from .normals_compiled import best_turn
 from .normals_compiled import turn_back as turn_back
-from .payload import Layout, Packed, Unpacked, plane_window
+from .payload import CONTEXT, Layout, Packed, Placed, Unpacked
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from .channels import Channels
+    from .context import Near
 
 PAD = 64
 """Far samples in front of the first, so that every sample has a full window."""
@@ -32,64 +37,60 @@ DIGIT = 11
 _EXACT_FLOATS = {"nnan", "nsz"}
 
 
-def encode(
+def arrange(lattice: NDArray[np.int64], rows: NDArray[np.uint32], begin: int, end: int) -> Placed:
+    """Put the samples begin to end in the order of the file."""
+    rotation, flips, nbits, shift, corner, code, order = _arrange(lattice, rows, begin, end)
+    position = np.empty((end - begin, 3), np.uint16)
+    _gather_position(lattice, corner, shift, order, position)
+    return Placed(rotation, flips, nbits, shift, corner, order, code, position)
+
+
+def pack(
+    placed: Placed,
     lattice: NDArray[np.int64],
     rows: NDArray[np.uint32],
-    begin: int,
-    end: int,
     channels: Channels,
     window: int,
-    planes: bool = False,
+    near: Near | None,
 ) -> Packed:
-    """Pack the samples begin to end, normals predicted by planes if that is asked for and worth it."""
-    rotation, flips, nbits, shift, corner, code, order = _arrange(lattice, rows, begin, end)
-    k = end - begin
-    position = np.empty((k, 3), np.uint16)
-    before = np.empty(k, np.int64)
-    sorted_rows = np.empty((len(channels), k), np.uint32)
-    _gather_samples(lattice, rows, corner, shift, order, position, sorted_rows)
-    turn = grid = 0
-    residuals = np.empty((0, k), np.uint32)
-    if len(channels):
-        _predecessors(position, window, before)
-    if len(channels.normals):
-        turn, least, turned = best_turn(sorted_rows, before, channels)
-        if planes:
-            near, back = plane_window(window, channels), before
-            if near != window:
-                back = np.empty(k, np.int64)
-                _predecessors(position, near, back)
-            grid, plane_turn, cost, residuals = best_planes(position, sorted_rows, back, channels, turn)
-            if not grid or cost >= least:
-                grid, residuals = 0, residuals[:0]
-        if grid:
-            window, turn = near, plane_turn
-        else:
-            sorted_rows = turned
+    """Pack a cloud; normals and colours are guessed from what is near if that is given."""
+    k = len(placed.order)
+    sorted_rows = rows[:, placed.order]
+    guessed = np.zeros(len(channels), np.bool_)
+    turn = 0
+    if near:
+        guessed[channels.guessed_rows] = True
+        turn = CONTEXT
+    before = np.zeros(k, np.int64)
+    window = 0 if guessed.all() else window
+    if window:
+        _predecessors(placed.position, window, before)
+    if near:
+        sorted_rows[guessed] = without_guesses(placed.position, sorted_rows, near, channels, placed.nbits)
+    elif len(channels.normals):
+        turn, sorted_rows = best_turn(sorted_rows, before, channels)
     raw, tokens = _pack(
-        lattice, corner, shift, 3 * nbits, order, code, sorted_rows, before, channels.bits, channels.start,
-        channels.normals, residuals,
+        lattice, placed.corner, placed.shift, 3 * placed.nbits, placed.order, placed.code, sorted_rows, before,
+        channels.bits, channels.start, guessed,
     )  # fmt: skip
-    x, y, z = corner.tolist()
-    return Packed(rotation, flips, turn, grid, window, nbits, shift, (x, y, z), raw, tokens)
+    return Packed(placed, turn, window, raw, tokens)
 
 
 def decode(payload: bytes, layout: Layout, channels: Channels) -> Unpacked:
-    """Unpack a payload that `parse_layout` found true."""
+    """Unpack a payload that `parse_layout` found true; guessed channels get their residuals, signed."""
     k = layout.samples
     data = np.frombuffer(payload + bytes(8), np.uint8)
     position = np.empty((k, 3), np.uint16)
     low = np.empty((k if layout.shift else 0, 3), np.uint32)
     rows = np.empty((len(channels), k), np.uint32)
-    before = np.empty(k, np.int64)
+    before = np.zeros(k, np.int64)
     added = np.ones(len(channels), np.bool_)
-    added[channels.normal_rows] = not layout.grid
+    if layout.turn == CONTEXT:
+        added[channels.guessed_rows] = False
     largest = _decode(
         data, layout.starts, layout.tokens, layout.rotation, layout.flips, layout.nbits, layout.shift, layout.window,
         channels.bits, channels.start, added, position, low, before, rows,
     )  # fmt: skip
-    if layout.grid:
-        from_planes(position, before, rows, channels, layout.grid, layout.turn)
     return Unpacked(int(largest), position, low if layout.shift else None, rows)
 
 
@@ -246,9 +247,6 @@ def _predecessors(position: Any, window: int, before: Any) -> None:
     if window == 64:  # a constant trip count is faster
         for i in range(k):
             before[i] = _nearest(xs, ys, zs, i, 64)
-    elif window == 40:
-        for i in range(k):
-            before[i] = _nearest(xs, ys, zs, i, 40)
     elif window == 16:
         for i in range(k):
             before[i] = _nearest(xs, ys, zs, i, 16)
@@ -341,24 +339,19 @@ def _arrange(lattice: Any, rows: Any, begin: int, end: int) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _gather_samples(
-    lattice: Any, rows: Any, corner: Any, shift: int, order: Any, position: Any, sorted_rows: Any
-) -> None:  # fmt: skip
-    """Local coordinates without low bits and channels, both in order."""
+def _gather_position(lattice: Any, corner: Any, shift: int, order: Any, position: Any) -> None:
+    """Local coordinates without low bits, in order."""
     for i in range(len(order)):
         for axis in range(3):
             position[i, axis] = (lattice[order[i], axis] - corner[axis]) >> shift
-    for row in range(len(sorted_rows)):
-        for i in range(len(order)):
-            sorted_rows[row, i] = rows[row, order[i]]
 
 
 @njit(cache=True, nogil=True)
 def _pack(
     lattice: Any, corner: Any, shift: int, code_bits: int, order: Any, code: Any, rows: Any, before: Any, bits: Any,
-    start: Any, normals: Any, residuals: Any,
+    start: Any, ready: Any,
 ) -> Any:  # fmt: skip
-    """Write all streams; `residuals` are those of the normals if planes predict them."""
+    """Write all streams; rows that are `ready` are numbers already."""
     k = len(order)
     raw_bits = 3 * shift + max(code_bits - 2, 0)
     for row in range(len(bits)):
@@ -381,13 +374,10 @@ def _pack(
     for i in range(1, k):
         number[i] = code[i] - code[i - 1]
     at = _write(number, tokens[0], raw, at)
-    place = np.full(len(bits), -1, np.int64)
-    for m in range(len(residuals) // 2):
-        place[normals[m, 0]], place[normals[m, 0] + 1] = 2 * m, 2 * m + 1
     for row in range(len(bits)):
-        if place[row] >= 0:
+        if ready[row]:
             for i in range(k):
-                number[i] = residuals[place[row], i]
+                number[i] = rows[row, i]
         else:
             _residuals(rows[row], before, bits[row], start[row], number)
         at = _write(number, tokens[1 + row], raw, at)
@@ -449,7 +439,8 @@ def _decode(
         position[i, a], position[i, b], position[i, c] = x ^ at_a, y ^ at_b, z ^ at_c
 
     if len(bits):
-        _predecessors(position, window, before)
+        if window:
+            _predecessors(position, window, before)
         for row in range(len(bits)):
             tokens += k
             bit = np.uint64(starts[2 + row] * 8)

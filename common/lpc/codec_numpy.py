@@ -10,75 +10,74 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .normals_numpy import best_planes, best_turn, from_planes
+from .guess_numpy import add_guesses as add_guesses
+from .guess_numpy import box as box
+from .guess_numpy import take as take
+from .guess_numpy import without_guesses
+from .normals_numpy import best_turn
 from .normals_numpy import turn_back as turn_back
-from .payload import RAW_BITS, TOP_BITS, Layout, Packed, Unpacked, may_flip, plane_window
+from .payload import CONTEXT, RAW_BITS, TOP_BITS, Layout, Packed, Placed, Unpacked, may_flip
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from .channels import Channels
+    from .context import Near
 
 _SPREAD = ((16, 0x0000FF0000FF), (8, 0x00F00F00F00F), (4, 0x0C30C30C30C3), (2, 0x249249249249))
 _GATHER = ((2, 0x0C30C30C30C3), (4, 0x00F00F00F00F), (8, 0x0000FF0000FF), (16, 0xFFFF))
 """Shift and mask per round: from 16 bits side by side to every third of 48, and back."""
 
 
-def encode(
-    lattice: NDArray[np.int64],
-    rows: NDArray[np.uint32],
-    begin: int,
-    end: int,
-    channels: Channels,
-    window: int,
-    planes: bool = False,
-) -> Packed:
-    """Pack the samples begin to end, normals predicted by planes if that is asked for and worth it."""
-    points, rows = lattice[begin:end], rows[:, begin:end]
+def arrange(lattice: NDArray[np.int64], rows: NDArray[np.uint32], begin: int, end: int) -> Placed:
+    """Put the samples begin to end in the order of the file."""
+    points = lattice[begin:end]
     corner = points.min(axis=0)
     local = points - corner
     width = int(local.max()).bit_length()
     shift = max(0, width - TOP_BITS)
     nbits = width - shift
     top = local >> shift
-
-    reach = (1 << nbits) - 1
     span = top.max(axis=0)
     rotation = min(range(3), key=lambda turn: _cost(_morton(top, turn)))
     flips = 0
     if may_flip(corner.tolist(), shift):
         flips = min(range(8), key=lambda flips: _cost(_morton(_flipped(top, span, flips), rotation)))
     code = _morton(_flipped(top, span, flips), rotation)
-    order = np.lexsort((*rows[::-1], *local.T[::-1], code))
-    code, top, local, rows = code[order], top[order], local[order], rows[:, order]
+    order = np.lexsort((*rows[::-1, begin:end], *local.T[::-1], code))
+    # The last sample of a flipped axis stands at the end of its range.
+    ahead = np.where(flips >> np.arange(3) & 1, (1 << nbits) - 1 - span, 0)
+    position = (top[order] + ahead).astype(np.uint16)
+    return Placed(rotation, flips, nbits, shift, corner - ahead, order + begin, code[order], position)
 
-    if flips:  # the last sample of a flipped axis stands at the end of its range
-        ahead = np.where(flips >> np.arange(3) & 1, reach - span, 0)
-        corner, top = corner - ahead, top + ahead
-    low_bits = (local & ((1 << shift) - 1)).astype(np.uint64).ravel()
+
+def pack(
+    placed: Placed,
+    lattice: NDArray[np.int64],
+    rows: NDArray[np.uint32],
+    channels: Channels,
+    window: int,
+    near: Near | None,
+) -> Packed:
+    """Pack a cloud; normals and colours are guessed from what is near if that is given."""
+    code, shift = placed.code, placed.shift
+    rows = rows[:, placed.order]
+    low_bits = ((lattice[placed.order] - placed.corner) & ((1 << shift) - 1)).astype(np.uint64).ravel()
     streams = [_pack_bits(low_bits, np.full(low_bits.size, shift, np.int64))] if shift else []
-    numbers = [np.diff(code, prepend=np.uint64(0))]
-    before = _nearest(top, window)
-    turn = grid = 0
-    residuals = np.empty((0, len(code)), np.uint32)
-    if len(channels.normals):
-        turn, least, turned = best_turn(rows, before, channels)
-        if planes:
-            near = plane_window(window, channels)
-            grid, plane_turn, cost, residuals = best_planes(
-                top.astype(np.uint16), rows, _nearest(top, near), channels, turn
-            )
-            if cost >= least:
-                grid = 0
-        if grid:
-            window, turn = near, plane_turn
-        else:
-            rows = turned
-    channel_numbers = [_zigzag(rows[row], before, channels, row) for row in range(len(channels))]
-    if grid:
-        for row, residual in zip(channels.normal_rows.tolist(), residuals, strict=True):
-            channel_numbers[row] = residual.astype(np.uint64)
-    numbers += channel_numbers
+    guessed = channels.guessed_rows if near else []
+    window = window if len(guessed) < len(channels) else 0
+    before = _nearest(placed.position, window)
+    turn = CONTEXT if near else 0
+    if not near and len(channels.normals):
+        turn, rows = best_turn(rows, before, channels)
+    residuals: list[Any] = [
+        None if row in guessed else _zigzag(rows[row], before, channels, row) for row in range(len(channels))
+    ]
+    if near:
+        found = without_guesses(placed.position, rows, near, channels, placed.nbits)
+        for row, residual in zip(guessed, found, strict=True):
+            residuals[row] = residual.astype(np.uint64)
+    numbers = [np.diff(code, prepend=np.uint64(0)), *residuals]
     tokens = np.empty((len(numbers), len(code)), np.uint8)
     for stream, number in enumerate(numbers):
         length = _bit_length(number)
@@ -86,12 +85,11 @@ def encode(
         next_bit = (number >> raw.astype(np.uint64)).astype(np.int64) & 1
         tokens[stream] = np.where(length < 2, number.astype(np.int64), ((length - 1) << 1) | next_bit)
         streams.append(_pack_bits(number & ((np.uint64(1) << raw.astype(np.uint64)) - np.uint64(1)), raw))
-    x, y, z = corner.tolist()
-    return Packed(rotation, flips, turn, grid, window, nbits, shift, (x, y, z), np.concatenate(streams), tokens)
+    return Packed(placed, turn, window, np.concatenate(streams), tokens)
 
 
 def decode(payload: bytes, layout: Layout, channels: Channels) -> Unpacked:
-    """Unpack a payload that `parse_layout` found true."""
+    """Unpack a payload that `parse_layout` found true; guessed channels get their residuals, signed."""
     data = np.frombuffer(payload + bytes(8), np.uint8)
     k, starts = layout.samples, layout.starts.tolist()
     tokens = data[layout.tokens : layout.tokens + (1 + len(channels)) * k].reshape(-1, k)
@@ -115,8 +113,8 @@ def decode(payload: bytes, layout: Layout, channels: Channels) -> Unpacked:
             number = _numbers(data, starts[2 + row], tokens[1 + row]).astype(np.uint32)
             residuals[row, 1:] = (number >> np.uint32(1)) ^ (np.uint32(0) - (number & np.uint32(1)))
         before = _nearest(position, layout.window)
-        stored = residuals[channels.normal_rows, 1:]
-        added = set(range(len(channels))) - (set(channels.normal_rows.tolist()) if layout.grid else set())
+        guessed = channels.guessed_rows if layout.turn == CONTEXT else []
+        added = set(range(len(channels))) - set(guessed)
         jump = np.zeros(k + 1, np.intp)
         jump[1:] = np.where(before == 0, 0, np.arange(1, k + 1) - before)
         while added and jump.any():
@@ -125,9 +123,7 @@ def decode(payload: bytes, layout: Layout, channels: Channels) -> Unpacked:
             jump = jump.take(jump)
         modulo = ((np.int64(1) << channels.bits) - 1).astype(np.uint32)
         rows = (residuals[:, 1:] + channels.start[:, None]) & modulo[:, None]
-        if layout.grid:
-            rows[channels.normal_rows] = stored
-            from_planes(position, before, rows, channels, layout.grid, layout.turn)
+        rows[guessed] = residuals[guessed, 1:]
     return Unpacked(int(code.max()), position, low, rows)
 
 

@@ -38,6 +38,8 @@ class Density:
         R_j: spacing of all of the model's samples in the cell, model units.
     drawn : (nodes,) float64
         Share of them that the node and its ancestors hold.
+    own : (nodes,) float64
+        Share of them that the node holds.
     coarseness : (nodes,) float64
         Spacing that a picture shows where it ends at the node, model units: r_j, or in an uneven cell the root of the
         mean square over its area, as far as the index is known.
@@ -51,6 +53,7 @@ class Density:
     def __init__(self, nodes: int) -> None:
         self.full = np.zeros(nodes)
         self.drawn = np.zeros(nodes)
+        self.own = np.zeros(nodes)
         self.coarseness = np.zeros(nodes)
         self.uneven = np.zeros(nodes, bool)
         self.area = np.zeros(nodes)
@@ -74,6 +77,7 @@ class Density:
         inside = np.where(above < 0, subtree, self._inside[above] * subtree / below)
         count = inside - subtree + index.samples[nodes]
         self._inside[nodes], self.drawn[nodes] = inside, count / inside
+        self.own[nodes] = index.samples[nodes] / inside
         self.full[nodes] = index.spacing[nodes] * np.sqrt(count / inside)
         self.area[nodes] = index.spacing[nodes] ** 2 * count
         self._square[nodes] = self.area[nodes] * self.full[nodes] ** 2

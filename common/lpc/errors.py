@@ -5,7 +5,7 @@
     LpcError                       everything a user can be told about in one line
     ├── FormatError (ValueError)   bytes that are not what docs/format.md says
     │   ├── NotAModel              the first bytes are no .lpc header
-    │   ├── UnsupportedVersion     a newer format than this program reads
+    │   ├── UnsupportedVersion     an older or newer format than this program reads
     │   └── Corrupt                lengths, counts, checksums or shapes that cannot be true
     │       └── Truncated          the bytes given end too early; `needed` says how many it takes
     ├── StoreError (OSError)       a model that cannot be reached or read

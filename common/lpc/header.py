@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAGIC = b"\x89LPC\r\n\x1a\n"
-MAJOR, MINOR = 1, 0
+MAJOR, MINOR = 2, 0
 HEADER_PROBE = 65536  # bytes of the first read: header, first page and first clouds
 PART_SUFFIX = (
     ".present"  # of a file beside a copy of which only parts are here: it says which, and the copy is no model alone
@@ -136,7 +136,7 @@ def parse_header(data: _Bytes | memoryview) -> Header:
     NotAModel
         If the magic is another.
     UnsupportedVersion
-        If the major version is newer.
+        If the major version is another.
     Truncated
         If `data` ends inside the header; its `needed` is the length of the file up to page 0.
     Corrupt
@@ -149,7 +149,8 @@ def parse_header(data: _Bytes | memoryview) -> Header:
         raise Truncated(f"the file ends inside its header, after {len(data)} bytes", _FIXED.size)
     _, major, _, length, crc, _ = _FIXED.unpack_from(data)
     if major != MAJOR:
-        raise UnsupportedVersion(f"the file is of format version {major}, this program reads {MAJOR}: update it")
+        what = "update it" if major > MAJOR else "build the model again, or read it with the program that built it"
+        raise UnsupportedVersion(f"the file is of format version {major}, this program reads {MAJOR}: {what}")
     if length > MAX_TEXT:
         raise Corrupt(f"header: {length} bytes of text (at most {MAX_TEXT})")
     page0 = _padded(length)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from .header import MAJOR
 from .octahedral import max_error_degrees
 
 if TYPE_CHECKING:
     from .attributes import Attribute
     from .header import Header
-
-FORMAT = "lpc 1"
 
 
 def info_dict(header: Header) -> dict[str, Any]:
@@ -27,7 +26,7 @@ def info_dict(header: Header) -> dict[str, Any]:
         ``here`` what is there of a file that may be cut short.
     """
     return {
-        "format": FORMAT,
+        "format": f"lpc {MAJOR}",
         "complete": True,
         "samples": header.samples,
         "clouds": header.nodes,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -19,17 +19,15 @@ if TYPE_CHECKING:
 
     from .channels import Channels
 
-CODEC = 1
-HEADER = struct.Struct("<BBBBBBBB")
+CODEC = 2
+HEADER = struct.Struct("<BBBBBBB")
 MAX_SAMPLES = 1 << 20
 MAX_WINDOW = 64
-PLANE_WINDOW = 40
 MAX_CORNER_BYTES = 7
 TURNS = 6
+CONTEXT = 6
+"""In place of a turn: normals and colours are guessed from the context."""
 TOP_BITS = 16
-FIRST_GRID, LAST_GRID = 8, 79
-"""Cells of planes: 4 / 7 of a local unit to 2**17 of them."""
-MAX_GRID_SAMPLES = 1 << 16
 MAX_SHIFT = 32
 ORIGIN_LIMIT = 1 << 52
 """Lattice coordinates stay below this, so float64 holds them exactly."""
@@ -38,19 +36,32 @@ RAW_BITS = np.array([0, 0] + [(token >> 1) - 1 for token in range(2, 256)], np.u
 """Raw bits that follow a token."""
 
 
-def table_bits(samples: int) -> int:
-    """Bits an axis of the number of a node among those of so many samples (docs/format.md, Planes)."""
-    return ((16 * samples - 1).bit_length() + 2) // 3
-
-
-def plane_window(window: int, channels: Channels) -> int:
-    """Previous samples to look at where planes predict the normals: they need fewer, other channels do not."""
-    return min(window, PLANE_WINDOW) if len(channels) == 2 * len(channels.normals) else window
-
-
 def may_flip(corner: list[int], shift: int) -> bool:
     """Whether a writer may flip axes: it moves the corner back by less than 2**16, which must not leave the lattice."""
     return shift == 0 and min(corner) > (1 << TOP_BITS) - ORIGIN_LIMIT
+
+
+class Placed(NamedTuple):
+    """The samples of a cloud in the order of the file.
+
+    Parameters
+    ----------
+    rotation, flips, nbits, shift : int
+    corner : ndarray, (3,) int64
+    order : ndarray, (k,) of integers
+        Sample numbers.
+    code : ndarray, (k,) uint64
+    position : ndarray, (k, 3) uint16
+    """
+
+    rotation: int
+    flips: int
+    nbits: int
+    shift: int
+    corner: NDArray[np.int64]
+    order: NDArray[Any]
+    code: NDArray[np.uint64]
+    position: NDArray[np.uint16]
 
 
 class Packed(NamedTuple):
@@ -59,14 +70,9 @@ class Packed(NamedTuple):
     `raw` are the padded bit streams, `tokens` is (1 + c, k) uint8: position, then the channels.
     """
 
-    rotation: int
-    flips: int
+    placed: Placed
     turn: int
-    grid: int
     window: int
-    nbits: int
-    shift: int
-    origin: tuple[int, int, int]
     raw: NDArray[np.uint8]
     tokens: NDArray[np.uint8]
 
@@ -90,7 +96,7 @@ class Layout:
 
     Parameters
     ----------
-    samples, rotation, flips, turn, grid, nbits, shift, origin, window
+    samples, rotation, flips, turn, nbits, shift, origin, window
         As in docs/format.md.
     starts : ndarray, (2 + c,) int64
         Byte offsets of the raw streams in the payload: low bits, position, channels.
@@ -102,7 +108,6 @@ class Layout:
     rotation: int
     flips: int
     turn: int
-    grid: int
     nbits: int
     shift: int
     origin: tuple[int, int, int]
@@ -113,12 +118,12 @@ class Layout:
 
 def pack_header(packed: Packed) -> bytes:
     """Return the bytes before the raw streams."""
-    corner_bytes = max((corner ^ (corner >> 63)).bit_length() // 8 + 1 for corner in packed.origin)
-    head = HEADER.pack(
-        CODEC, packed.rotation | packed.flips << 2, packed.nbits, packed.shift, packed.window, packed.turn,
-        corner_bytes, packed.grid,
-    )  # fmt: skip
-    return head + b"".join(corner.to_bytes(corner_bytes, "little", signed=True) for corner in packed.origin)
+    placed = packed.placed
+    corners = placed.corner.tolist()
+    corner_bytes = max((corner ^ (corner >> 63)).bit_length() // 8 + 1 for corner in corners)
+    axes = placed.rotation | placed.flips << 2
+    head = HEADER.pack(CODEC, axes, placed.nbits, placed.shift, packed.window, packed.turn, corner_bytes)
+    return head + b"".join(corner.to_bytes(corner_bytes, "little", signed=True) for corner in corners)
 
 
 def largest_payload(samples: int, channels: Channels) -> int:
@@ -156,14 +161,12 @@ def parse_layout(payload: bytes, *, samples: int, channels: Channels) -> Layout:
     streams = 1 + len(channels)
     if len(payload) < HEADER.size + streams * samples:
         raise Corrupt(f"cloud: {len(payload)} bytes cannot hold {samples} samples")
-    codec, axes, nbits, shift, window, turn, corner_bytes, grid = HEADER.unpack_from(payload)
+    codec, axes, nbits, shift, window, turn, corner_bytes = HEADER.unpack_from(payload)
     if codec != CODEC:
         raise Corrupt(f"cloud: codec {codec} is unknown")
     rotation, flips = axes & 3, axes >> 2
-    if rotation > 2 or flips > 7 or turn >= TURNS or window > MAX_WINDOW or corner_bytes > MAX_CORNER_BYTES:
+    if rotation > 2 or flips > 7 or turn > CONTEXT or window > MAX_WINDOW or corner_bytes > MAX_CORNER_BYTES:
         raise Corrupt(f"cloud: its header {payload[: HEADER.size].hex()} is out of range")
-    if grid and (not FIRST_GRID <= grid <= LAST_GRID or samples > MAX_GRID_SAMPLES):
-        raise Corrupt(f"cloud: grid {grid} of {samples} samples is out of range")
     if nbits > TOP_BITS or shift > MAX_SHIFT or (shift and nbits < TOP_BITS):
         raise Corrupt(f"cloud: {nbits} + {shift} bits a coordinate are not allowed")
     head = HEADER.size + 3 * corner_bytes
@@ -187,6 +190,6 @@ def parse_layout(payload: bytes, *, samples: int, channels: Channels) -> Layout:
         raise Corrupt(f"cloud: {len(payload)} bytes, its tokens ask for {ends[-1] + streams * samples}")
     starts = np.concatenate(([head], ends[:-1]))
     return Layout(
-        samples=samples, rotation=rotation, flips=flips, turn=turn, grid=grid, nbits=nbits, shift=shift,
-        origin=(x, y, z), window=window, starts=starts, tokens=int(ends[-1]),
+        samples=samples, rotation=rotation, flips=flips, turn=turn, nbits=nbits, shift=shift, origin=(x, y, z),
+        window=window, starts=starts, tokens=int(ends[-1]),
     )  # fmt: skip

@@ -34,6 +34,7 @@ from .extend import OldModel
 from .folder import Folder, manifest_of, was_written, work_folder
 from .frame import Frame, choose_step
 from .inputs import Inputs, Source, expand, open_inputs
+from .inside import HINT, is_inside_out, root_samples
 from .journal import as_array, from_array
 from .options import BuildOptions
 from .progress import Progress, Silent
@@ -104,7 +105,7 @@ def build_model(
     clock : callable
         Seconds, monotonic.
     tell : callable
-        Gets a sentence where a build that was killed left files, and where the scans differ.
+        Gets a sentence where a build that was killed left files, where the scans differ, where normals point inwards.
     cluster : Cluster, optional
         Workers that sort and encode; without them threads do.
     append : Path, optional
@@ -142,6 +143,8 @@ def build_model(
         if not kernels_are_loaded():
             _warm(folder)
         header, kept = _build(sources, out, folder, options, progress, cluster, tell, old)
+        if is_inside_out(root_samples(out, header)):
+            tell(f"{out}: {HINT}")
     seconds = clock() - began
     return BuildReport(header=header, seconds=seconds, peak_rss_bytes=memory.peak_bytes(), clouds_kept=kept)
 
@@ -221,7 +224,7 @@ def _build(
         clouds = None if old is None or cluster else old.clouds(found, frame, options, GENERATOR)
         return publish(
             division, found, frame, inputs, options,
-            folder=folder, out=out, crew=crew, progress=progress, old=clouds,
+            folder=folder, out=out, crew=crew, progress=progress, ancestor_bytes=sizes.ancestors, old=clouds,
         )  # fmt: skip
 
 

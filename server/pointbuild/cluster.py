@@ -26,6 +26,7 @@ import numpy as np
 import zstandard
 
 from lpc.errors import BuildError
+from lpc.header import MAJOR
 
 from .publish import GENERATOR
 from .share import Share, SharedRegions
@@ -134,7 +135,7 @@ def _load(share: Share, name: str) -> Callable[[Any], Any]:
 def versions() -> tuple[str, ...]:
     """Everything that the bytes of a model depend on besides its samples and options."""
     zstd = ".".join(map(str, zstandard.ZSTD_VERSION))
-    return GENERATOR, f"numpy {np.__version__}", f"numba {numba.__version__}", f"zstd {zstd}"
+    return GENERATOR, f"format {MAJOR}", f"numpy {np.__version__}", f"numba {numba.__version__}", f"zstd {zstd}"
 
 
 @contextmanager

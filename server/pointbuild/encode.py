@@ -15,22 +15,32 @@ import numpy as np
 from numba import njit
 
 from lpc.bounds import decode_centers, quantise_cones, quantise_spheres
-from lpc.codec import Effort, encode_clouds
+from lpc.codec import CloudWriter, Effort
+from lpc.context import ANCESTORS, has_context, line_of, with_ancestors
 from lpc.octahedral import decode_normals, encode_normals
 from lpc.octahedral_compiled import unit_vectors
 from lpc.page import RECORD
 
+from .ancestry import Ancestor, Ancestry
 from .extend import OWNER
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from lpc.attributes import Schema
+    from lpc.cloud import Cloud
+    from lpc.payload import Placed
 
     from .assemble import Nodes
     from .extend import OldClouds
     from .frame import Frame
     from .rows import Rows
+
+
+RUN_SAMPLES = 1 << 16
+"""Encoded at a time by one thread, ancestors included."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,53 +105,106 @@ def encode_run(
     regions: Rows,
     schema: Schema,
     effort: Effort,
+    ancestry: Ancestry,
     old: OldClouds | None = None,
 ) -> Run:
     """Encode nodes `first` to `stop - 1`, but for those that are clouds of an older model."""
-    counts = nodes.samples[first:stop]
-    bounds = np.concatenate([[0], np.cumsum(counts)])
-    rows = np.empty(bounds[-1], regions.dtype)
-    at = 0
-    for run in range(nodes.run_start[first], nodes.run_start[stop]):
-        count = int(nodes.run_count[run])
-        regions.read(int(nodes.run_first[run]), rows[at : at + count])
-        at += count
-    lattice = rows["xyz"].astype(np.int64)
-    codes = {attribute.name: rows[attribute.name] for attribute in schema}
-    frames, kept = _frames(lattice, codes, rows, bounds, schema, effort, old)
+    generations = ANCESTORS if has_context(schema) else 0
+    family = with_ancestors(np.arange(first, stop), nodes.parent, generations)
+    known = ancestry.find(family[family < first].tolist())
+    family = family[[node not in known for node in family.tolist()]]
+    bounds = np.concatenate([[0], np.cumsum(nodes.samples[family])])
+    lattice, owner, codes = _read(family, bounds, nodes, regions, schema)
+    writer = CloudWriter(lattice, codes, bounds, schema, effort=effort)
+    found = np.full(len(family), -1) if old is None else old.find(owner, bounds)
+    clouds = _Clouds(writer, dict(zip(family.tolist(), found.tolist(), strict=True)), known)
+    frames, kept = [], 0
+    for node in range(first, stop):
+        line = line_of(node, nodes.parent) if generations else []
+        if old and old.stays(clouds.old(node), [clouds.old(above) for above in line]):
+            frames.append(old.frame(clouds.old(node)))
+            kept += 1
+            continue
+        frames.append(writer.frame(clouds.placed(node), [clouds.cloud(above) for above in line]))
+        if generations and nodes.subtree[node] > nodes.samples[node]:
+            clouds.cloud(node)
+    ancestry.keep(clouds.made, nodes.depth, int(nodes.depth[first]))
+    before = len(family) - (stop - first)
+    own = int(bounds[before])
+    lattice, bounds = lattice[own:], bounds[before:] - own
     shape = (stop - first, int(nodes.depth[first:stop].max()) + 1)
     reach, spread = np.zeros(shape), np.zeros(shape)
     _reach(lattice, bounds, first, nodes.parent, nodes.depth, geometry.origin, geometry.step, geometry.center, reach)
     for attribute in schema:
         if attribute.kind == "normal":
-            normals = unit_vectors(rows[attribute.name], attribute.bits)
+            normals = unit_vectors(codes[attribute.name][own:], attribute.bits)
             _spread(normals, bounds, first, nodes.parent, nodes.depth, geometry.axis, spread)
     sizes = np.array([len(frame) for frame in frames], np.uint32)
     return Run(first, frames, sizes, np.array([zlib.crc32(frame) for frame in frames], np.uint32), reach, spread, kept)
 
 
-def _frames(
-    lattice: NDArray[np.int64],
-    codes: dict[str, NDArray[Any]],
-    rows: NDArray[Any],
-    bounds: NDArray[np.int64],
-    schema: Schema,
-    effort: Effort,
-    old: OldClouds | None,
-) -> tuple[list[bytes], int]:
-    """Frames of clouds, and how many of them are old."""
-    if old is None:
-        return encode_clouds(lattice, codes, bounds, schema, effort=effort), 0
-    found = old.find(rows[OWNER], bounds)
-    fresh = np.flatnonzero(found < 0)
-    changed = np.repeat(found < 0, np.diff(bounds))
-    ends = np.concatenate([[0], np.cumsum(np.diff(bounds)[fresh])])
-    written = encode_clouds(
-        lattice[changed], {name: values[changed] for name, values in codes.items()}, ends, schema, effort=effort
-    )
-    frames = dict(zip(fresh.tolist(), written, strict=True))
-    frames.update(zip(np.flatnonzero(found >= 0).tolist(), old.frames(found[found >= 0]), strict=True))
-    return [frames[cloud] for cloud in range(len(found))], len(found) - len(fresh)
+class _Clouds:
+    """The clouds of a run, and those of their ancestors.
+
+    Parameters
+    ----------
+    writer : CloudWriter
+    found : dict of int to int
+        By node what the writer has, in its order: the cloud of an older model that it is, or -1.
+    known : mapping of int to Ancestor
+        All other ancestors.
+    """
+
+    def __init__(self, writer: CloudWriter, found: dict[int, int], known: Mapping[int, Ancestor]) -> None:
+        self._writer, self._found, self._known = writer, found, known
+        self._number = {node: number for number, node in enumerate(found)}
+        self._placed: dict[int, Placed] = {}
+        self._clouds = {node: ancestor.cloud for node, ancestor in known.items()}
+
+    def old(self, node: int) -> int:
+        """Cloud of the older model that has the samples of a node, and no others; -1: none."""
+        return self._found[node] if node in self._found else self._known[node].old
+
+    def placed(self, node: int) -> Placed:
+        """Put the samples of a node that the writer has in order, once."""
+        if node not in self._placed:
+            self._placed[node] = self._writer.place(self._number[node])
+        return self._placed[node]
+
+    @property
+    def made(self) -> dict[int, Ancestor]:
+        """All of these whose clouds were asked for."""
+        return {node: Ancestor(cloud, self.old(node)) for node, cloud in self._clouds.items()}
+
+    def cloud(self, node: int) -> Cloud:
+        """Cloud of a node, as it will be decoded."""
+        if node not in self._clouds:
+            self._clouds[node] = self._writer.cloud(self.placed(node))
+        return self._clouds[node]
+
+
+def _read(
+    family: NDArray[np.int64], bounds: NDArray[np.int64], nodes: Nodes, regions: Rows, schema: Schema
+) -> tuple[NDArray[np.int64], NDArray[np.uint32], dict[str, NDArray[Any]]]:
+    """Lattice points, owners and codes of the samples of some nodes; whole rows are here for one run of them only."""
+    names = [attribute.name for attribute in schema]
+    columns = {name: np.empty((bounds[-1], *regions.dtype[name].shape), regions.dtype[name].base) for name in names}
+    lattice = np.empty((bounds[-1], 3), np.int64)
+    owner = np.zeros(bounds[-1], np.uint32)
+    known = OWNER in (regions.dtype.names or ())
+    at = 0
+    for node in family.tolist():
+        for run in range(nodes.run_start[node], nodes.run_start[node + 1]):
+            rows = np.empty(int(nodes.run_count[run]), regions.dtype)
+            regions.read(int(nodes.run_first[run]), rows)
+            to = slice(at, at + len(rows))
+            lattice[to] = rows["xyz"]
+            if known:
+                owner[to] = rows[OWNER]
+            for name in names:
+                columns[name][to] = rows[name]
+            at = to.stop
+    return lattice, owner, columns
 
 
 def kernels_are_loaded() -> bool:

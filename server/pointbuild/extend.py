@@ -3,22 +3,24 @@
 A model is made of the lattice points and codes of its samples (`frame`), so what is decoded from it serves as well as
 what it was built of: the model of these samples and of others is, byte for byte, the one that all scans together give
 on the same lattice. Each of its samples brings the number of the cloud it was in. A cloud of the new model whose
-samples are all those of one old cloud, and no others, is that cloud, and its bytes are copied.
+samples are all those of one old cloud, and no others, is that cloud, and its bytes are copied if its nearest ancestors,
+from which they are guessed (`lpc.context`), did not change either.
 """
 
 from __future__ import annotations
 
 import os
 import zlib
+from collections import ChainMap
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lpc.codec import decode_cloud, samples_to_points
+from lpc.context import ANCESTORS, has_context, line_of
 from lpc.errors import BuildError, FormatError
 from lpc.header import HEADER_PROBE, PART_SUFFIX, parse_header
 from lpc.index import IndexTree
@@ -34,12 +36,15 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from lpc.cloud import Cloud
     from lpc.header import Header
 
     from .frame import Frame
     from .inputs import Inputs
     from .options import BuildOptions
     from .survey import Survey
+
+    Clouds = dict[int, Cloud]
 
 OWNER = "\0cloud"
 """Name of the column that says which cloud of the old model a sample was in, counted from 1; 0: it is new."""
@@ -127,36 +132,70 @@ class OldModel:
         )
 
     def batches(self, size: int) -> Iterator[PointBatch]:
-        """Yield all samples in the order of the clouds, with `OWNER`.
+        """Yield all samples, subtree by subtree, with `OWNER`.
 
         A decoded position may lie half a step outside the box of the input; it is given on the box, which is nearest to
         the same lattice point.
         """
-        size = max(size // (DECODERS + 2), 1)  # so many runs are here at a time
-        samples = np.cumsum(self.index.samples)
-        cuts = [0]
-        while cuts[-1] < len(samples):
-            reached = samples[cuts[-1] - 1] if cuts[-1] else 0
-            cuts.append(max(int(np.searchsorted(samples, reached + size, side="right")), cuts[-1] + 1))
+        size = max(size // (DECODERS + 2), 1)  # so many subtrees are here at a time
         # Decoding takes longer than everything else that reads a scan.
-        with ThreadPoolExecutor(DECODERS, thread_name_prefix="decode") as pool:
-            for _, batch in in_order(lambda run: pool.submit(self._decode, *run), pairwise(cuts), DECODERS):
+        with ThreadPoolExecutor(DECODERS, thread_name_prefix="decode") as pool, self.path.open("rb") as file:
+            parts = self._parts(size, file.fileno())
+            for _, batch in in_order(lambda part: pool.submit(self._batch, *part, file.fileno()), parts, DECODERS):
                 yield batch
 
-    def _decode(self, first: int, stop: int) -> PointBatch:
-        """Give the samples of nodes `first` to `stop - 1`."""
-        header, clouds = self.header, []
-        with self.path.open("rb") as file, _told(self.path):
-            for node in range(first, stop):
-                frame, samples = self.frame(file.fileno(), node), int(self.index.samples[node])
-                clouds.append(decode_cloud(frame, samples=samples, schema=header.attributes))
+    def _parts(self, size: int, file: int) -> Iterator[tuple[list[int], Clouds]]:
+        """Cut the tree into subtrees of at most `size` samples and single nodes above them.
+
+        Each comes with the clouds that it is told from; a node above comes decoded, since those below it need it.
+        """
+        todo: list[tuple[int, Clouds]] = [(0, {})]
+        while todo:
+            node, line = todo.pop()
+            if self.index.subtree[node] <= size:
+                yield self._below(node), line
+            else:
+                known = line | self._decoded([node], line, file)
+                yield [node], known
+                line = dict(list(known.items())[-ANCESTORS:])
+                todo += [(child, line) for child in self.index.children[node].tolist() if child >= 0]
+
+    def _below(self, node: int) -> list[int]:
+        """Give a node and its descendants, parents first."""
+        level, found = np.array([node]), []
+        while len(level):
+            found.append(level)
+            level = self.index.children[level].ravel()
+            level = level[level >= 0]
+        return np.concatenate(found).tolist()
+
+    def _batch(self, nodes: list[int], known: Clouds, file: int) -> PointBatch:
+        """Give the samples of some nodes; `known` are their ancestors that are not among them."""
+        header, decoded = self.header, self._decoded(nodes, known, file)
+        clouds = [decoded[node] for node in nodes]
         codes = {
             entry.name: np.concatenate([cloud.codes[entry.name] for cloud in clouds]) for entry in header.attributes
         }
         points = samples_to_points(np.concatenate([cloud.lattice() for cloud in clouds]), codes, header)
         xyz = np.clip(points.xyz, header.bounds[:3], header.bounds[3:])
-        owner = np.repeat(np.arange(first, stop, dtype=np.uint32) + np.uint32(1), self.index.samples[first:stop])
+        owner = np.repeat(np.array(nodes, np.uint32) + np.uint32(1), self.index.samples[nodes])
         return PointBatch(xyz, {**points.attributes, OWNER: owner})
+
+    def _decoded(self, nodes: list[int], known: Clouds, file: int) -> Clouds:
+        """Decode nodes, parents first, but for those that are known."""
+        found = {node: known[node] for node in nodes if node in known}
+        schema, clouds = self.header.attributes, ChainMap(found, known)
+        with _told(self.path):
+            for node in nodes:
+                if node not in found:
+                    frame, samples = self.frame(file, node), int(self.index.samples[node])
+                    context = [clouds[above] for above in self.line(node)]
+                    found[node] = decode_cloud(frame, samples=samples, schema=schema, context=context)
+        return found
+
+    def line(self, node: int) -> list[int]:
+        """Nodes that tell a cloud, from the root down."""
+        return line_of(node, self.index.parent) if has_context(self.header.attributes) else []
 
     def frame(self, file: int, node: int) -> bytes:
         """Bytes of a cloud, checked."""
@@ -269,7 +308,7 @@ class OldClouds:
     model: OldModel
 
     def find(self, owner: NDArray[np.uint32], bounds: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Old cloud that each cloud is, -1: none.
+        """Old cloud that has the samples of each cloud, and no others; -1: none.
 
         Parameters
         ----------
@@ -278,15 +317,20 @@ class OldClouds:
         bounds : ndarray, (k + 1,) int64
             Cloud i is the samples ``bounds[i]`` to ``bounds[i + 1]``.
         """
-        first = owner[bounds[:-1]].astype(np.int64) - 1
-        one = np.minimum.reduceat(owner, bounds[:-1]) == np.maximum.reduceat(owner, bounds[:-1])
-        return np.where(one & (first >= 0) & (self.model.index.samples[first] == np.diff(bounds)), first, -1)
+        starts = bounds[:-1]
+        number = owner[starts].astype(np.int64) - 1
+        one = np.minimum.reduceat(owner, starts) == np.maximum.reduceat(owner, starts)
+        return np.where(one & (number >= 0) & (self.model.index.samples[number] == np.diff(bounds)), number, -1)
 
-    def frames(self, nodes: NDArray[np.int64]) -> list[bytes]:
-        """Bytes of old clouds."""
+    def stays(self, number: int, line: list[int]) -> bool:
+        """Whether a cloud that is old cloud `number`, and whose ancestors are those of `line`, has the same bytes."""
+        return number >= 0 and self.model.line(number) == line
+
+    def frame(self, number: int) -> bytes:
+        """Bytes of an old cloud."""
         file = os.open(self.model.path, os.O_RDONLY | os.O_CLOEXEC)
         try:
-            return [self.model.frame(file, node) for node in nodes.tolist()]
+            return self.model.frame(file, number)
         finally:
             os.close(file)
 

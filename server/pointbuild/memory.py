@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lpc.context import ANCESTORS
 from lpc.errors import BuildError
 
 from .bucket import MAX_BUCKET
+from .encode import RUN_SAMPLES
 
 if TYPE_CHECKING:
     from .options import BuildOptions
@@ -30,10 +32,11 @@ LEAST_BLOCK = 1 << 13
 
 @dataclass(frozen=True, slots=True)
 class Sizes:
-    """What a build may hold at a time: samples of a block and of a bucket, and threads."""
+    """What a build may hold at a time: samples of a block and of a bucket, bytes of ancestors, and threads."""
 
     block: int
     bucket: int
+    ancestors: int
     threads: int
 
 
@@ -60,19 +63,27 @@ def choose_sizes(options: BuildOptions, samples: int, row_bytes: int, resident: 
     least_bucket = max(4 * options.cloud_size, 1 << 16)
     per_sample = bucket_bytes(row_bytes)
     threads, read = options.workers, read_bytes(row_bytes)
-    while threads > 1 and room < threads * least_bucket * per_sample + (threads + 2) * LEAST_BLOCK * read:
+    encode = encode_bytes(row_bytes, options.cloud_size)
+    while threads > 1 and (
+        room < threads * least_bucket * per_sample + (threads + 2) * LEAST_BLOCK * read or room < threads * encode
+    ):
         threads -= 1
     block = min(room // ((threads + 2) * read), BEST_BLOCK)
     fair = max(samples // (4 * (threads + 2)), least_bucket)  # buckets that move are on disk twice: a quarter in all
     best = min(max(samples // MANY_BUCKETS, BEST_BUCKET), MOST_BUCKET)
     bucket = min(room // (threads * per_sample), best, fair)
-    if block < LEAST_BLOCK or bucket < least_bucket:
-        need = held + least_bucket * per_sample + 3 * LEAST_BLOCK * read
+    if block < LEAST_BLOCK or bucket < least_bucket or room < encode:
+        need = held + max(least_bucket * per_sample + 3 * LEAST_BLOCK * read, encode)
         raise BuildError(
             f"{options.memory_bytes >> 20} MiB of memory are too few for clouds of {options.cloud_size}: "
             f"allow at least {(need >> 20) + 1} MiB (--memory)"
         )
-    return Sizes(options.block_samples or block, min(options.bucket_samples or bucket, MAX_BUCKET), threads)
+    return Sizes(
+        block=options.block_samples or block,
+        bucket=min(options.bucket_samples or bucket, MAX_BUCKET),
+        ancestors=(room - threads * encode) // 2,
+        threads=threads,
+    )
 
 
 def bucket_bytes(row_bytes: int) -> int:
@@ -83,6 +94,11 @@ def bucket_bytes(row_bytes: int) -> int:
 def read_bytes(row_bytes: int) -> int:
     """Resident bytes per sample while blocks are read and scattered."""
     return READ_BYTES + ATTRIBUTE_BYTES * max(row_bytes - 32, 0)
+
+
+def encode_bytes(row_bytes: int, cloud_size: int) -> int:
+    """Resident bytes while a run of nodes is encoded: itself, its ancestors, and their codes in three forms."""
+    return (RUN_SAMPLES + (1 + ANCESTORS) * cloud_size) * (48 + 3 * row_bytes)
 
 
 def resident_bytes() -> int:

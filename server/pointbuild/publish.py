@@ -8,22 +8,24 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
+from lpc.context import ANCESTORS
 from lpc.header import Header
 from lpc.lattice import position_error_bound
 
+from .ancestry import Ancestry
 from .costs import cloud_costs, seal_with_costs
-from .encode import Geometry, Records, Run, encode_run
+from .encode import RUN_SAMPLES, Geometry, Records, Run, encode_run
 from .extend import PACKING, packing_of
 from .spacing import node_spacings
 from .write import write_model
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from lpc.attributes import Schema
-    from lpc.codec import Effort
 
     from .assemble import Nodes
     from .divide import Division
@@ -34,14 +36,10 @@ if TYPE_CHECKING:
     from .journal import Journal
     from .options import BuildOptions
     from .progress import Progress
-    from .rows import Rows
     from .survey import Survey
     from .work import Crew
 
 GENERATOR = "pointstream 0.1"
-
-RUN_SAMPLES = 1 << 15
-"""Encoded at a time by one thread."""
 
 COSTED_CLOUDS = 256
 """Clouds, evenly over the tree, that say what each kind of number costs."""
@@ -58,6 +56,7 @@ def publish(
     out: Path,
     crew: Crew,
     progress: Progress,
+    ancestor_bytes: int = 0,
     old: OldClouds | None = None,
 ) -> tuple[Header, int]:
     """Write the model; its header, and how many clouds of an older model are in it.
@@ -73,6 +72,8 @@ def publish(
         The model.
     crew, progress
         Threads, and who is told.
+    ancestor_bytes : int
+        Memory for clouds that others are told from.
     old : OldClouds, optional
         Clouds that need not be encoded.
     """
@@ -85,7 +86,11 @@ def publish(
     with path.open("r+b") as clouds:
         records = Records(nodes, geometry, spacing)
         journal = folder.journal("encode")
-        costs, kept = _encode(records, clouds, journal, division.rows, found, options.effort, old, crew, progress)
+        one = partial(
+            _encode_run, nodes=nodes, geometry=geometry, regions=division.rows, schema=found.schema,
+            effort=options.effort, ancestry=Ancestry(ancestor_bytes), old=old,
+        )  # fmt: skip
+        costs, kept = _encode(records, clouds, journal, one, len(found.schema), crew, progress)
         division.rows.remove()  # their room is the model's
         header = Header(
             bytes=2**53,
@@ -123,25 +128,17 @@ def _encode(
     records: Records,
     clouds: BinaryIO,
     journal: Journal,
-    regions: Rows,
-    found: Survey,
-    effort: Effort,
-    old: OldClouds | None,
+    one: Callable[[tuple[int, int]], tuple[Run, NDArray[np.float64]]],
+    attributes: int,
     crew: Crew,
     progress: Progress,
 ) -> tuple[NDArray[np.float64], int]:
-    """Write all clouds in order and fill the records.
+    """Write all clouds in order and fill the records; `one` encodes a run.
 
     Returns what positions and attributes cost in some of the clouds, and how many are old.
     """
-    nodes, geometry = records.nodes, records.geometry
-    costed = np.unique(np.linspace(0, len(nodes) - 1, COSTED_CLOUDS).astype(int))
-    schema = found.schema
-    one = partial(
-        _encode_run, costed=costed, nodes=nodes, geometry=geometry, regions=regions, schema=schema, effort=effort,
-        old=old,
-    )  # fmt: skip
-    costs = np.zeros(1 + len(found.schema))
+    nodes = records.nodes
+    costs = np.zeros(1 + attributes)
     waiting, kept = runs(nodes, RUN_SAMPLES), 0
     for sizes, checks, reach, spread, part, same in journal:
         kept += int(same)
@@ -163,11 +160,12 @@ def _encode(
 
 
 def _encode_run(
-    run: tuple[int, int], *, costed: NDArray[np.int64], nodes: Nodes, schema: Schema, **shared: Any
+    run: tuple[int, int], *, nodes: Nodes, schema: Schema, **shared: Any
 ) -> tuple[Run, NDArray[np.float64]]:
-    """Encode a run of nodes; and the `cloud_costs` of those of its clouds that are `costed`."""
+    """Encode a run of nodes; and the `cloud_costs` of some of its clouds, evenly over the tree."""
     first, stop = run
     encoded = encode_run(first, stop, nodes=nodes, schema=schema, **shared)
+    costed = np.unique(np.linspace(0, len(nodes) - 1, COSTED_CLOUDS).astype(int))
     costs = np.zeros(1 + len(schema))
     for node in costed[(costed >= first) & (costed < stop)].tolist():
         costs += cloud_costs(encoded.frames[node - first], int(nodes.samples[node]), schema)
@@ -175,8 +173,12 @@ def _encode_run(
 
 
 def runs(nodes: Nodes, samples: int) -> list[tuple[int, int]]:
-    """Cut the nodes into runs of about so many samples."""
-    run = np.cumsum(nodes.samples) // samples
+    """Cut the nodes into runs of about so many samples, ancestors included that the nodes before do not share."""
+    cost, line = nodes.samples.copy(), np.arange(len(nodes))
+    for _ in range(ANCESTORS):
+        line = np.where(line < 0, -1, nodes.parent[line])
+        cost += np.where((line >= 0) & (np.diff(line, prepend=-1) != 0), nodes.samples[line], 0)
+    run = np.cumsum(cost) // samples
     starts = np.flatnonzero(np.diff(run, prepend=-1)).tolist()
     return list(zip(starts, [*starts[1:], len(nodes)], strict=True))
 

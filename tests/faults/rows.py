@@ -339,7 +339,7 @@ HOSTILE = [
     Row(name="empty file", shown="nothing", report="ends inside its header", data=lambda _: b""),
     Row(name="header: not one", shown="nothing", report="no .lpc|not a", data=lambda data: b"\0" * 100_000),
     Row(
-        name="header: newer version", shown="nothing", report="version", data=lambda data: data[:8] + b"\x02" + data[9:]
+        name="header: newer version", shown="nothing", report="version", data=lambda data: data[:8] + b"\x03" + data[9:]
     ),
     Row(name="header: damaged", shown="nothing", report="header", data=lambda data: data[:60] + b"?" + data[61:]),
     Row(name="header: negative length", shown="nothing", report="header", data=header(b'"bytes":1', b'"bytes":-')),

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cloud_strategies import ATTRIBUTES, RawCloud, random_codes, raw_clouds
+from cloud_strategies import ATTRIBUTES, RawCloud, assert_same, random_codes, raw_clouds, rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.cloud import read_cloud
@@ -23,26 +23,6 @@ from lpc.octahedral import decode_normals, encode_normals
 from lpc.payload import pack_header, parse_layout
 
 NORMAL = ATTRIBUTES[0]
-
-
-def rows(lattice: Any, codes: dict[str, Any]) -> list[list[int]]:
-    """Samples with their codes as lists of integers, sorted: to compare as sets with repetitions."""
-    parts = [np.asarray(lattice).astype(object)]
-    parts += [np.asarray(values).reshape(len(parts[0]), -1).astype(object) for values in codes.values()]
-    return sorted(np.concatenate(parts, axis=1).tolist())
-
-
-def assert_same(first: Cloud, second: Cloud) -> None:
-    assert first.shift == second.shift
-    np.testing.assert_array_equal(first.origin, second.origin)
-    np.testing.assert_array_equal(first.position, second.position)
-    assert (first.low is None) == (second.low is None)
-    if first.low is not None and second.low is not None:
-        np.testing.assert_array_equal(first.low, second.low)
-    assert first.codes.keys() == second.codes.keys()
-    for name, values in first.codes.items():
-        assert values.dtype == second.codes[name].dtype
-        np.testing.assert_array_equal(values, second.codes[name])
 
 
 def encode(cloud: RawCloud, **options: Any) -> bytes:
@@ -85,10 +65,9 @@ def test_a_reader_written_from_the_specification_agrees(cloud: RawCloud) -> None
 @given(raw_clouds(), st.integers(0, 64))
 def test_any_window_decodes(cloud: RawCloud, window: int) -> None:
     channels = channels_of(cloud.schema)
+    rows = to_channels(cloud.codes, cloud.schema, len(cloud))
     packed = [
-        engine.encode(
-            cloud.lattice, to_channels(cloud.codes, cloud.schema, len(cloud)), 0, len(cloud), channels, window
-        )
+        engine.pack(engine.arrange(cloud.lattice, rows, 0, len(cloud)), cloud.lattice, rows, channels, window, None)
         for engine in (codec_compiled, codec_numpy)
     ]
     payloads = [pack_header(p) + p.raw.tobytes() + p.tokens.tobytes() for p in packed]

@@ -26,7 +26,7 @@ PLAIN = Header(
 )  # fmt: skip
 
 
-def file_of(text: bytes, *, major: int = 1, minor: int = 0) -> bytes:
+def file_of(text: bytes, *, major: int = 2, minor: int = 0) -> bytes:
     head = struct.pack("<8sHHIII", b"\x89LPC\r\n\x1a\n", major, minor, len(text), zlib.crc32(text), 0) + text
     return head.ljust(-(-len(head) // 8) * 8, b"\0")
 
@@ -61,7 +61,7 @@ def test_the_bytes_are_those_of_the_specification() -> None:
     data = PLAIN.to_bytes()
     magic, major, minor, length, crc, zero = struct.unpack_from("<8sHHIII", data)
     text = data[24 : 24 + length]
-    assert (magic, major, minor, zero) == (b"\x89LPC\r\n\x1a\n", 1, 0, 0)
+    assert (magic, major, minor, zero) == (b"\x89LPC\r\n\x1a\n", 2, 0, 0)
     assert crc == zlib.crc32(text)
     assert not data[24 + length :].strip(b"\0")
     entry = json.loads(text)
@@ -76,10 +76,12 @@ def test_other_files_are_no_models() -> None:
             parse_header(data)
 
 
-def test_a_newer_major_version_is_refused_and_a_newer_minor_one_read() -> None:
+def test_another_major_version_is_refused_and_a_newer_minor_one_read() -> None:
     text = json.dumps(PLAIN.to_json() | {"later": [1, 2]}).encode()
-    with pytest.raises(UnsupportedVersion, match="version 2"):
-        parse_header(file_of(text, major=2))
+    with pytest.raises(UnsupportedVersion, match="version 3, this program reads 2: update it"):
+        parse_header(file_of(text, major=3))
+    with pytest.raises(UnsupportedVersion, match="version 1, this program reads 2: build the model again"):
+        parse_header(file_of(text, major=1))
     header = parse_header(file_of(text, minor=7))
     assert header.extra == {"later": [1, 2]}
     assert header.samples == PLAIN.samples
@@ -155,7 +157,7 @@ def test_infinity_by_overflow_is_no_length() -> None:
 
 def test_a_text_length_beyond_the_limit_is_refused_unread() -> None:
     with pytest.raises(Corrupt, match="at most"):
-        parse_header(struct.pack("<8sHHIII", b"\x89LPC\r\n\x1a\n", 1, 0, MAX_TEXT + 1, 0, 0))
+        parse_header(struct.pack("<8sHHIII", b"\x89LPC\r\n\x1a\n", 2, 0, MAX_TEXT + 1, 0, 0))
     with pytest.raises(FormatError, match="shorten"):
         replace(PLAIN, bytes=10**6, crs="x" * MAX_TEXT).to_bytes()
 

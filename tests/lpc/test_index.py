@@ -14,7 +14,9 @@ from hypothesis import strategies as st
 from oracles.build import build_bytes
 from oracles.surfaces import bumpy, torus
 from strategies import FakeModel, fake_model, fake_models, levels_of, random_records
+from support.frames import decoded_clouds
 
+from lpc.cloud import Cloud
 from lpc.codec import cloud_to_points, decode_cloud
 from lpc.errors import Corrupt, FormatError, Truncated
 from lpc.header import Header, compute_digest, parse_header
@@ -278,7 +280,7 @@ def test_any_prefix_is_a_complete_coarser_model(cloud_size: int) -> None:
     rng = np.random.default_rng(7)
     cuts = {0, 23, 24, whole.header.page0 - 1, whole.header.page0, len(data) - 1, len(data)}
     cuts |= {int(end) + by for end in ends[::3] for by in (-1, 0, 1)} | set(rng.integers(0, len(data), 60).tolist())
-    seen: dict[int, int] = {}
+    seen: dict[int, Cloud] = {}
     for length in sorted(cuts):
         tree = cut_model(data, min(length, len(data)))
         if tree is None:
@@ -294,13 +296,16 @@ def test_any_prefix_is_a_complete_coarser_model(cloud_size: int) -> None:
             frame = data[:length][place.start : place.stop]
             assert zlib.crc32(frame) == tree.crc[node]
             if node not in seen:
-                seen[int(node)] = len(
-                    decode_cloud(frame, samples=int(tree.samples[node]), schema=tree.header.attributes)
-                )
+                line, above = [], int(tree.parent[node])
+                while above >= 0:
+                    line.append(seen[above])
+                    above = int(tree.parent[above])
+                samples, schema, context = int(tree.samples[node]), tree.header.attributes, line[::-1]
+                seen[int(node)] = decode_cloud(frame, samples=samples, schema=schema, context=context)
         for page in np.flatnonzero(~tree.page_loaded & (tree.page_offset > 0)):
             with pytest.raises(Truncated):
                 tree.add_page(int(page), data[int(tree.page_offset[page]) : length])
-    assert sum(seen.values()) == len(points)
+    assert sum(map(len, seen.values())) == len(points)
 
 
 def test_an_oracle_built_file_holds_exactly_its_input() -> None:
@@ -309,11 +314,7 @@ def test_an_oracle_built_file_holds_exactly_its_input() -> None:
     tree = load_all(data)
     header: Header = tree.header
     assert compute_digest(header, [b"".join(records(data, tree))]) == header.digest
-    decoded = []
-    for node in range(header.nodes):
-        place = tree.cloud_range(node)
-        cloud = decode_cloud(data[place.start : place.stop], samples=int(tree.samples[node]), schema=header.attributes)
-        decoded.append(cloud_to_points(cloud, header))
+    decoded = [cloud_to_points(cloud, header) for cloud in decoded_clouds(data)]
     # The clouds of a subtree lie in its sphere and its cone, as decoded.
     for node in range(header.nodes):
         above = node

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lpc.attributes import Attribute, Schema
-from lpc.codec import encode_cloud
+from lpc.codec import decode_cloud, encode_cloud
 from lpc.header import Header, seal
 from lpc.lattice import position_error_bound, position_step, quantise
 from lpc.octahedral import decode_normals, encode_normals
@@ -24,6 +24,7 @@ from lpc.page import NO_CONE, RECORD, pack_pages
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from lpc.cloud import Cloud
     from lpc.points import PointBatch
 
 
@@ -83,8 +84,12 @@ def build_bytes(
     lattice = quantise(xyz, low, step)
     records = np.zeros(len(nodes), RECORD)
     clouds = []
+    lines: dict[int, list[Cloud]] = {id(nodes[0]): []}  # decoded ancestors of each node, from the root down
     for record, node in zip(records, nodes, strict=True):
-        cloud = encode_cloud(lattice[node.own], {name: values[node.own] for name, values in codes.items()}, schema)
+        own, context = {name: values[node.own] for name, values in codes.items()}, lines[id(node)]
+        cloud = encode_cloud(lattice[node.own], own, schema, context=context)
+        decoded = decode_cloud(cloud, samples=len(node.own), schema=schema, context=context)
+        lines |= {id(child): [*context, decoded] for child in node.children if child is not None}
         clouds.append(cloud)
         record["size"], record["crc"] = len(cloud), zlib.crc32(cloud)
         record["samples"], record["subtree"], record["spacing"] = len(node.own), len(node.all), node.spacing

@@ -26,19 +26,23 @@ class Bits:
         return (self.at + 7) // 8
 
 
-def read_cloud(frame: bytes, samples: int, attributes: list[dict[str, Any]]) -> Samples:
+def read_cloud(
+    frame: bytes, samples: int, attributes: list[dict[str, Any]], ancestors: list[Samples] | None = None
+) -> Samples:
     """Lattice coordinates under "lattice", codes by attribute name.
 
     Parameters
     ----------
+    ancestors : list of dict
+        What this function gave for them, from the root down.
     attributes : list of dict
         The header's entries: `name`, `kind`, `bits`.
     """
     payload = zstandard.ZstdDecompressor().decompress(frame)
-    assert payload[0] == 1
-    axes, nbits, shift, window, turn, corner_bytes, grid = payload[1:8]
+    assert payload[0] == 2
+    axes, nbits, shift, window, turn, corner_bytes = payload[1:7]
     rotation, flips = axes % 4, axes // 4
-    at = 8
+    at = 7
     corner = []
     for _ in range(3):
         corner.append(int.from_bytes(payload[at : at + corner_bytes], "little", signed=True))
@@ -91,15 +95,9 @@ def read_cloud(frame: bytes, samples: int, attributes: list[dict[str, Any]]) -> 
         for residual, j in zip(row_of, before, strict=True):
             row.append(((start if j is None else row[j]) + residual) % levels)
         rows.append(row)
-    if grid:
-        normals = directions(top, grid)
-        first = 0
-        for entry in attributes:
-            if entry["kind"] == "normal":
-                pairs = list(zip(residuals[first], residuals[first + 1], strict=True))
-                codes = on_planes(normals, pairs, before, entry["bits"], turn)
-                rows[first], rows[first + 1] = [pair[0] for pair in codes], [pair[1] for pair in codes]
-            first += {"normal": 2, "color": 3}.get(entry["kind"], 2 if entry["bits"] > 32 else 1)
+    if turn == 6:
+        guessed_fields(top, corner, shift, nbits, attributes, residuals, rows, (ancestors or [])[-4:])
+        turn = 0
 
     out: Samples = {
         "lattice": [tuple(corner[a] + ((top[i][a] << shift) | low[i][a]) for a in range(3)) for i in range(samples)]
@@ -118,89 +116,115 @@ def read_cloud(frame: bytes, samples: int, attributes: list[dict[str, Any]]) -> 
     return out
 
 
-def wrapped(value: int) -> int:
-    """Modulo 2**64, signed."""
-    return (value + (1 << 63)) % (1 << 64) - (1 << 63)
+def interleaved(place: list[int], nbits: int, order: int) -> int:
+    """Code of a place in one of the two orders."""
+    cells = [(p + order * (2**nbits // 3)) >> max(0, nbits - 7) for p in place]
+    return sum((cell >> bit & 1) << (3 * bit + axis) for axis, cell in enumerate(cells) for bit in range(8))
 
 
-def cut(values: list[int]) -> list[int]:
-    length = max((~v if v < 0 else v).bit_length() for v in values)
-    return [v >> max(0, length - 20) for v in values]
-
-
-def directions(points: list[list[int]], grid: int) -> list[list[int]]:
-    """Least axis of the samples around each."""
-    axes = 0
-    while 8**axes < 16 * len(points):
-        axes += 1
-    scaled = [[(p * 32 * (7 - (grid & 3))) >> (grid >> 2) for p in point] for point in points]
-    corners = [(a, b, c) for a in (0, 1) for b in (0, 1) for c in (0, 1)]
-
-    def share(u: list[int], corner: tuple[int, int, int]) -> tuple[tuple[int, ...], int]:
-        key, weight = [], 1
-        for value, step in zip(u, corner, strict=True):
-            f = ((value & 31) + 2) >> 2
-            weight *= f if step else 8 - f
-            key.append(((value >> 5) + step) % 2**axes)
-        return tuple(key), weight
-
-    nodes: dict[tuple[int, ...], list[int]] = {}
-    for u in scaled:
-        x, y, z = u
-        terms = [1, x, y, z, x * x, y * y, z * z, x * y, x * z, y * z]
-        for corner in corners:
-            key, weight = share(u, corner)
-            sums = nodes.setdefault(key, [0] * 10)
-            nodes[key] = [s + weight * term for s, term in zip(sums, terms, strict=True)]
+def companies(
+    top: list[list[int]], places: list[list[int]], nbits: int
+) -> list[list[tuple[bool, int, int]]]:  # fmt: skip
+    """Whether of the context, number and weight of each member of each sample's company."""
+    orders = [sorted((interleaved(place, nbits, o), j) for j, place in enumerate(places)) for o in (0, 1)]
     found = []
-    for u in scaled:
-        total = [0] * 10
-        for corner in corners:
-            key, weight = share(u, corner)
-            total = [s + weight * v for s, v in zip(total, nodes[key], strict=True)]
-        s, x, y, z = total[:4]
-        xx, yy, zz, xy, xz, yz = cut([
-            wrapped(s * moment - one * other)
-            for moment, one, other in zip(total[4:], (x, y, z, x, x, y), (x, y, z, y, z, z), strict=True)
-        ])  # fmt: skip
-        a, b, c, d, e, f = cut([
-            yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy,
-            xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - yz * xx,
-        ])  # fmt: skip
-        columns = [[a, d, e], [d, b, f], [e, f, c]]
-        column = columns[[a, b, c].index(max(a, b, c))]
-        found.append(cut([sum(p * q for p, q in zip(line, column, strict=True)) for line in columns]))
+    for i, point in enumerate(top):
+        members = []
+        for o, line in enumerate(orders):
+            s = sum(code < interleaved(point, nbits, o) for code, _ in line)
+            members += [(True, line[at][1]) for at in range(s - 2, s + 2) if 0 <= at < len(line)]
+        reach = 1 if i % 2 else 2 if i % 4 else 0
+        members += [(False, j) for j in (i - reach, i + reach) if reach and j < len(top)]
+        sizes = []
+        for context, j in members:
+            other = places[j] if context else top[j]
+            d = 1 + sum((p - q) ** 2 for p, q in zip(point, other, strict=True))
+            sizes.append(2 * d.bit_length() + (d >> (d.bit_length() - 2) & 1 if d > 1 else 0))
+        found.append([(*member, 64 >> (t - min(sizes))) for member, t in zip(members, sizes, strict=True)])
     return found
 
 
-def on_planes(
-    normals: list[list[int]], residuals: list[tuple[int, int]], before: list[int | None], bits: int, turn: int
-) -> list[tuple[int, int]]:  # fmt: skip
-    """Code pairs, still turned."""
+def guessed_fields(
+    top: list[list[int]], corner: list[int], shift: int, nbits: int, attributes: list[dict[str, Any]],
+    residuals: list[list[int]], rows: list[list[int]], ancestors: list[Samples],
+) -> None:  # fmt: skip
+    """Put the codes of normals and colours into their rows."""
+    low, high = ([pick(axis) for axis in zip(*top, strict=True)] for pick in (min, max))
+    places, known = [], []
+    for cloud in ancestors:
+        for j, point in enumerate(cloud["lattice"]):
+            place = [(p - c) >> shift for p, c in zip(point, corner, strict=True)]
+            if all(a <= p <= b for a, p, b in zip(low, place, high, strict=True)):
+                places.append(place)
+                known.append((cloud, j))
+    company = companies(top, places, nbits)
+    layers = [*range(0, len(top), 4), *range(2, len(top), 4), *range(1, len(top), 2)]
+    first = 0
+    for entry in attributes:
+        bits, name = entry["bits"], entry["name"]
+        m = (1 << (bits - 1)) - 1
+        if entry["kind"] == "scalar":
+            first += 2 if bits > 32 else 1
+            continue
+        if entry["kind"] == "normal":
+            there = [point_of(*cloud[name][j], m) for cloud, j in known]
+        else:
+            there = [ycocg(*cloud[name][j]) for cloud, j in known]
+        own: dict[int, tuple[int, int, int]] = {}
+        for i in layers:
+            weights = sum(weight for _, _, weight in company[i])
+            sums = [
+                sum(weight * (there[j] if context else own[j])[axis] for context, j, weight in company[i])
+                for axis in range(3)
+            ]
+            if entry["kind"] == "normal":
+                pair, own[i] = seen_along(sums, (residuals[first][i], residuals[first + 1][i]), bits)
+                rows[first][i], rows[first + 1][i] = pair
+            else:
+                means = [(2 * total + weights) // (2 * weights) if weights else 0 for total in sums]
+                codes = [
+                    (mean + residuals[first + c][i]) % ((1 if c == 0 else 2) << bits) for c, mean in enumerate(means)
+                ]
+                for c in range(3):
+                    rows[first + c][i] = codes[c]
+                co, cg = (value - (2 << bits) if value >= 1 << bits else value for value in codes[1:])
+                own[i] = (codes[0], co, cg)
+        first += 2 if entry["kind"] == "normal" else 3
+
+
+def seen_along(
+    sums: list[int], residual: tuple[int, int], bits: int
+) -> tuple[tuple[int, int], tuple[int, int, int]]:  # fmt: skip
+    """Code pair and point of a normal."""
     m = (1 << (bits - 1)) - 1
-    small = [r if 5 * max(abs(r[0]), abs(r[1])) < 1 << bits else (0, 0) for r in residuals]
-    codes: list[tuple[int, int]] = []
-    for (x, y, z), residual, j in zip(normals, residuals, before, strict=True):
-        n = max(1, abs(x) + abs(y) + abs(z))
-        px = (2 * m * abs(x) + n) // (2 * n)
-        py = min((2 * m * abs(y) + n) // (2 * n), m - px)
-        p = [px * sign(x), py * sign(y), (m - px - py) * sign(z)]
-        q = turn >> 1
-        p = [p[q], p[(q + 1) % 3], p[(q + 2) % 3] * (-1 if turn & 1 else 1)]
-        last = (0, 0, m) if j is None else unfolded(*codes[j], m)
-        if sum(a * b for a, b in zip(p, last, strict=True)) < 0:
-            p = [-a for a in p]
-        guess = folded(*p, m)
-        carry = [4, 4]
-        if j is not None:
-            further = before[j]
-            second = (0, 0) if further is None else small[further]
-            carry = [4 + 3 * a + b for a, b in zip(small[j], second, strict=True)]
-        first, other = (
-            (g + (c >> 3) + r) % (1 << bits) for g, c, r in zip(guess, carry, residual, strict=True)
-        )  # fmt: skip
-        codes.append((first, other))
-    return codes
+    sizes = [abs(value) for value in sums]
+    q = sizes.index(max(sizes))
+    n = max(1, sum(sizes))
+    parts = [sums[(q + i) % 3] for i in (1, 2)]
+    pair = [
+        (m + sign(part) * ((2 * m * abs(part) + n) // (2 * n)) + r) % (1 << bits)
+        for part, r in zip(parts, residual, strict=True)
+    ]
+    assert max(pair) <= 2 * m
+    if pair == [0, 0]:
+        return (0, 0), (0, 0, 0)
+    x, y, z = unfolded(*pair, m)
+    p = [0, 0, 0]
+    p[(q + 1) % 3], p[(q + 2) % 3], p[q] = x, y, sign(sums[q]) * z
+    return folded(*p, m), (p[0], p[1], p[2])
+
+
+def point_of(first: int, second: int, m: int) -> tuple[int, int, int]:
+    """Integer point of a code pair; 0 of no normal."""
+    return (0, 0, 0) if first == second == 0 else unfolded(first, second, m)
+
+
+def ycocg(red: int, green: int, blue: int) -> tuple[int, int, int]:
+    """YCoCg-R with signed chroma."""
+    co = red - blue
+    t = blue + (co >> 1)
+    cg = green - t
+    return t + (cg >> 1), co, cg
 
 
 def unfolded(first: int, second: int, m: int) -> tuple[int, int, int]:

@@ -192,7 +192,9 @@ def test_any_split_of_any_samples(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     places = np.array(xyz)
-    values = {"v": (np.arange(len(xyz)) * 7 % 5).astype(np.int16)} if scalar else {}
+    numbers = np.arange(len(xyz))
+    color = np.stack([numbers * 11 % 256, numbers % 3, numbers * 5 % 256], axis=1).astype(np.uint8)
+    values = {"v": (numbers * 7 % 5).astype(np.int16)} if scalar else {"color": color}
     points = PointBatch(places, values)
     bounds = sorted({0, len(xyz), *(cut for cut in cuts if cut < len(xyz))})
     parts = [points.take(slice(first, stop)) for first, stop in pairwise(bounds)]

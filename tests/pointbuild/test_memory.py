@@ -19,7 +19,7 @@ from oracles import surfaces
 from lpc.errors import BuildError
 from pointbuild import BuildOptions, build_model
 from pointbuild.arrays import ArrayScan
-from pointbuild.memory import NODE_BYTES, RESERVE, bucket_bytes, choose_sizes, read_bytes
+from pointbuild.memory import NODE_BYTES, RESERVE, bucket_bytes, choose_sizes, encode_bytes, read_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -48,6 +48,7 @@ def test_sizes_stay_under_the_ceiling(memory: int, samples: int, row: int, cloud
     held = 150 * MEBI + RESERVE + NODE_BYTES * 2 * (samples // cloud_size)
     assert held + sizes.threads * sizes.bucket * bucket_bytes(row) <= memory * MEBI
     assert held + (sizes.threads + 2) * sizes.block * read_bytes(row) <= memory * MEBI
+    assert held + sizes.threads * encode_bytes(row, cloud_size) + sizes.ancestors <= memory * MEBI
     assert 1 <= sizes.threads <= threads
     assert sizes.bucket >= 4 * cloud_size
 

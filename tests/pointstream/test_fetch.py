@@ -8,11 +8,13 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from support.frames import subtrees, whole_index
 from support.hosts import origin_of, virtual_store
 from support.servers import REPOSITORY, serve_in_thread
 
@@ -25,8 +27,10 @@ from pointlink.faults import Flip, Reset
 from pointlink.profiles import ADSL
 from pointstream import command
 from pointstream.fetch import FetchOptions, FetchReport, copy_name, fetch
-from pointstream.reading import Region
+from pointstream.reading import Reader, Region
+from pointstream.stores import open_store
 from pointstream.stores.sparse import SparseFile, map_path
+from pointstream.verify import VerifyReport, verify
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -43,6 +47,17 @@ def copy(origin: Origin, out: Path, **options: Any) -> FetchReport:
     return virtual.run(main())
 
 
+def verified(path: Path) -> VerifyReport:
+    async def main() -> VerifyReport:
+        store = open_store(str(path), clock=time.monotonic)
+        try:
+            return await verify(await Reader.open(store))
+        finally:
+            await store.close()
+
+    return asyncio.run(main())
+
+
 def asked(origin: Origin) -> int:
     return sum(exchange.stop - exchange.start for exchange in origin.log)
 
@@ -53,6 +68,7 @@ def test_a_whole_copy_is_the_origins_bytes(model: bytes, tmp_path: Path) -> None
     assert out.read_bytes() == model
     assert [path.name for path in out.parent.iterdir()] == ["model.lpc"]
     assert (report.complete, report.bytes, report.clouds) == (True, len(model), report.clouds_total)
+    assert report.bytes_fetched == len(model), "what the opening brought too"
     again = origin_of(model)
     assert copy(again, out).bytes_fetched == 0
     assert asked(again) == parse_header(model).page0
@@ -74,7 +90,8 @@ def test_a_region_is_a_model_that_has_every_sample_of_the_region(model: bytes, t
         assert 0 < len(mine) < len(part.read()) < len(whole.read())
     assert command.run(["verify", str(out)]) == 1
     rest = origin_of(model)
-    assert copy(rest, out).complete
+    completed = copy(rest, out)
+    assert (completed.complete, completed.bytes_fetched) == (True, len(model) - report.bytes)
     assert out.read_bytes() == model
     assert not map_path(out).exists()
     assert asked(rest) < len(model), "what was here is fetched again"
@@ -178,6 +195,22 @@ def test_a_cloud_damaged_at_its_origin_is_told_and_left_out(model: bytes, tmp_pa
     assert report.clouds == report.clouds_total - 1
     with pointstream.open(str(out)) as part:
         assert len(part.read()) < part.header.samples
+
+
+def test_what_a_damaged_cloud_tells_is_copied_and_neither_read_nor_taken_for_damaged(
+    model: bytes, tmp_path: Path
+) -> None:
+    out, index, damaged = tmp_path / "model.lpc", whole_index(model), bytearray(model)
+    damaged[index.offset[2] + 15] ^= 2
+    report = copy(origin_of(bytes(damaged)), out)
+    assert [text.split(":")[0] for text in report.problems] == ["cloud 2"]
+    assert report.clouds == report.clouds_total - 1
+    untold = subtrees(index, [2])
+    with pointstream.open(str(out)) as part:
+        assert len(part.read()) == part.header.samples - int(index.samples[untold].sum())
+    copied = verified(out)
+    assert copied.clouds_checked == report.clouds
+    assert f"{len(untold) - 1} sound clouds of " in copied.problems[1]
 
 
 @pytest.mark.parametrize("there", ["other build", "foreign", "folder"])

@@ -26,10 +26,13 @@ def damaged(model: bytes, node: int) -> bytes:
     return bytes(broken)
 
 
+DATA = Path(__file__).parents[1] / "data"
 KINDS: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "stranger": (lambda model: b"ply\nformat ascii 1.0\n" * 100, "no .lpc file"),
     "checksum": (lambda model: model[:40] + bytes([model[40] ^ 1]) + model[41:], "header: "),
     "short": (lambda model: model[:100], "ends"),
+    "older": (lambda _: (DATA / "version1.lpc").read_bytes(), "version 1, this program reads 2: build the model again"),
+    "newer": (lambda model: model[:8] + b"\3" + model[9:], "version 3, this program reads 2: update it"),
 }
 
 

@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import shells
+from support.frames import decoded_clouds, whole_index
 from support.servers import serve_in_thread
 
 import pointstream
-from lpc.codec import cloud_to_points, decode_cloud
+from lpc.codec import cloud_to_points
 from lpc.errors import Corrupt, ModelChanged, NotFound, StoreError
 from lpc.header import parse_header
 from lpc.index import IndexTree
@@ -45,18 +46,7 @@ def opened(path: Path) -> Model:
 def clouds(model: bytes) -> tuple[IndexTree, list[PointBatch]]:
     """All clouds, read in the most obvious way."""
     header = parse_header(model)
-    index = IndexTree(header)
-    for page in range(len(index.page_loaded)):
-        place = index.page_range(page)
-        index.add_page(page, model[place.start : place.stop])
-    found = []
-    for node in range(len(index)):
-        place = index.cloud_range(node)
-        cloud = decode_cloud(
-            model[place.start : place.stop], samples=int(index.samples[node]), schema=header.attributes
-        )
-        found.append(cloud_to_points(cloud, header))
-    return index, found
+    return whole_index(model), [cloud_to_points(cloud, header) for cloud in decoded_clouds(model)]
 
 
 def same(a: PointBatch, b: PointBatch) -> None:

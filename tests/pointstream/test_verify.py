@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.build import build_bytes
+from support.frames import subtrees, whole_index
 
 from lpc.header import parse_header, seal
 from lpc.index import IndexTree
@@ -184,15 +185,18 @@ def test_a_cut_file_says_how_much_is_missing(length: int, model: bytes) -> None:
 
 
 def test_every_damaged_cloud_is_named(model: bytes) -> None:
-    index = IndexTree(parse_header(model))
-    place = index.page_range(0)
-    index.add_page(0, model[place.start : place.stop])
+    index = whole_index(model)
     damaged = bytearray(model)
-    for node in (2, 11):
+    below = int(index.children[int(index.children[2, 1]), 0])  # what a damaged cloud tells is checked, too
+    bad = [2, 11, below]
+    for node in bad:
         damaged[index.offset[node] + 15] ^= 2
     report = check(bytes(damaged))
-    assert [text.split(":")[0] for text in report.problems[:2]] == ["cloud 2", "cloud 11"]
-    assert "the header says 20000" in report.problems[2]
+    assert [text.split(":")[0] for text in report.problems[:3]] == [f"cloud {node}" for node in sorted(bad)]
+    untold = np.setdiff1d(subtrees(index, bad), bad)
+    samples = int(index.samples[untold].sum())
+    assert report.problems[3].startswith(f"{len(untold)} sound clouds of {samples:,} samples cannot be decoded")
+    assert "the header says 20000" in report.problems[4]
 
 
 def test_a_damaged_page_hides_its_clouds_and_the_rest_is_checked(model: bytes) -> None:

@@ -47,13 +47,13 @@ def samples_of(model, cut, camera):
     for number in cut.nodes.tolist():
         xyz, codes = model.positions(number), model.clouds[number].codes
         inside, (_, depth) = camera.to_camera(xyz), camera.project(xyz)
+        spacings = walk.of_samples(number) if cut.places is not None else np.full(len(xyz), walk.spacing[number])
         normals = decode_normals(codes["normal"], 8).astype(float) if "normal" in codes else np.zeros(xyz.shape)
         colors = codes["color"] if "color" in codes else np.full(xyz.shape, Style().surface)
         for i in range(len(xyz)):
             if depth[i] <= cut.depth_range[0] or normals[i] @ (xyz[i] - camera.eye) > 0:
                 continue
-            spacing = walk.at(number, xyz[i])[0] if cut.places is not None else walk.spacing[number]
-            side = min(splats.CLOSING * spacing * camera.focal / depth[i], splats.LARGEST)
+            side = min(splats.CLOSING * spacings[i] * camera.focal / depth[i], splats.LARGEST)
             plane, levels = np.array([0.0, 0.0, -1.0]), colors[i].astype(float)
             if normals[i].any():
                 normal = camera.rotation() @ normals[i]

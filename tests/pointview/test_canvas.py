@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from support import models
 
 from pointview.camera import Camera
@@ -43,25 +42,3 @@ def test_frames_that_are_kept_keep_their_pictures():
         for part, copy in zip((frame.rgb, frame.depth, frame.node, frame.starved), copies, strict=True):
             np.testing.assert_array_equal(part, copy)
     backend.close()
-
-
-def test_a_frame_that_fails_leaves_nothing_in_the_next(monkeypatch):
-    from pointview.render import kernels
-
-    model = models.torus(2000)
-    near, far = (
-        Camera(eye=(0, -distance, 1), target=(0, 0, 0), up=(0, 0, 1), width=60, height=40) for distance in (3.0, 9.0)
-    )
-    cuts = [refine(model.index, camera, 1.0, model.everything) for camera in (near, far)]
-    expected = CpuBackend(model.header).draw(cuts[1], model.take, far, Style())
-    backend = CpuBackend(model.header)
-
-    def fail(*_):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(kernels, "resolve", fail)
-        with pytest.raises(KeyboardInterrupt):
-            backend.draw(cuts[0], model.take, near, Style())
-    for _ in range(2):
-        np.testing.assert_array_equal(backend.draw(cuts[1], model.take, far, Style()).rgb, expected.rgb)

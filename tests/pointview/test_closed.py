@@ -60,3 +60,20 @@ def test_silhouettes_grow_by_less_than_half_the_spacing(scene, normals):
         cut = refine(model.index, camera, tolerance, resident)
         frame = backend.draw(cut, model.take, camera, Style())
         assert traced.growth(frame, exact) < 0.5 * max(1.0, cut.max_spacing_px), (tolerance, len(cut.nodes))
+
+
+@pytest.mark.parametrize("up", [0.55, 0.6, 0.7])
+def test_what_lies_between_silhouettes_stays_open(up):
+    """The hole of a torus, seen as a slit a few spacings wide: its corners look like gaps of the sampling."""
+    model = models.torus(60_000, cloud_size=2048)
+    camera = Camera(eye=(0.3, -2.8, 2.8 * up), target=(0, 0, 0), up=(0, 0, 1), width=400, height=300)
+    exact = traced.trace(traced.torus_distance, camera)
+    cut = refine(model.index, camera, 1.0, model.first(1))
+    backend = CpuBackend(model.header)
+    open_, closed = (backend.draw(cut, model.take, camera, Style(close_holes=close)) for close in (False, True))
+    outside = ~np.isfinite(exact) & np.isinf(open_.depth)
+    slit = (
+        outside & (np.cumsum(np.isfinite(exact), axis=0) > 0) & (np.cumsum(np.isfinite(exact)[::-1], axis=0)[::-1] > 0)
+    )
+    assert slit.sum() > 100
+    assert (slit & np.isfinite(closed.depth)).sum() < 0.08 * slit.sum()

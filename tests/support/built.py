@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from lpc.cloud import Cloud
+
 
 @dataclass(frozen=True)
 class Built:
@@ -53,14 +55,19 @@ def read_model(path: Path) -> Built:
     for page in range(header.pages):
         where = index.page_range(page)
         index.add_page(page, data[where.start : where.stop])
-    clouds = []
+    decoded: list[Cloud] = []
     for node in range(header.nodes):
         where = index.cloud_range(node)
         frame = data[where.start : where.stop]
         assert zlib.crc32(frame) == index.crc[node]
-        cloud = decode_cloud(frame, samples=int(index.samples[node]), schema=header.attributes)
-        clouds.append(cloud_to_points(cloud, header))
-    return Built(data, header, index, clouds)
+        line, above = [], int(index.parent[node])
+        while above >= 0:
+            line.append(decoded[above])
+            above = int(index.parent[above])
+        decoded.append(
+            decode_cloud(frame, samples=int(index.samples[node]), schema=header.attributes, context=line[::-1])
+        )
+    return Built(data, header, index, [cloud_to_points(cloud, header) for cloud in decoded])
 
 
 def numbered(xyz: NDArray[np.float64], **attributes: NDArray[Any]) -> PointBatch:

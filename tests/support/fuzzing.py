@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import zstandard
 from oracles.build import build_bytes
+from support.frames import decoded_clouds
 
 from lpc.codec import decode_cloud
 from lpc.errors import FormatError
@@ -24,6 +25,8 @@ from lpc.points import PointBatch
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from lpc.cloud import Cloud
 
 
 @cache
@@ -38,6 +41,12 @@ def sound() -> bytes:
         "class": draw.integers(0, 9, 900).astype(np.uint8),
     }
     return build_bytes(PointBatch(xyz, attributes), cloud_size=64, page_nodes=8)
+
+
+@cache
+def context() -> list[Cloud]:
+    """Clouds that any other may be told from."""
+    return decoded_clouds(sound())[:4]
 
 
 def _tree() -> IndexTree:
@@ -90,7 +99,7 @@ def read_cloud(data: bytes) -> None:
     outcomes = []
     for engine in ("numpy", "compiled"):
         try:
-            cloud = decode_cloud(frame, samples=samples, schema=header.attributes, engine=engine)  # type: ignore[arg-type]
+            cloud = decode_cloud(frame, samples=samples, schema=header.attributes, context=context(), engine=engine)  # type: ignore[arg-type]
         except FormatError as error:
             outcomes.append(type(error))
         else:

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from oracles import surfaces
 from oracles.build import build_bytes
+from support.frames import decoded_clouds, whole_index
 
-from lpc.codec import decode_cloud
 from lpc.header import Header, parse_header
-from lpc.index import IndexTree
 from lpc.points import PointBatch
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from lpc.cloud import Cloud
+    from lpc.index import IndexTree
 
 
 @dataclass
@@ -58,24 +58,7 @@ def build(
 
 def load(data: bytes, engine: Literal["auto", "numpy"] = "auto") -> Model:
     """Read a whole file."""
-    header = parse_header(data)
-    index = IndexTree(header)
-    while not index.page_loaded.all():
-        for page in np.flatnonzero(~index.page_loaded & (index.page_offset > 0)).tolist():
-            where = index.page_range(page)
-            index.add_page(page, data[where.start : where.stop])
-    clouds = []
-    for node in range(header.nodes):
-        where = index.cloud_range(node)
-        clouds.append(
-            decode_cloud(
-                data[where.start : where.stop],
-                samples=int(index.samples[node]),
-                schema=header.attributes,
-                engine=engine,
-            )
-        )
-    return Model(header=header, index=index, clouds=clouds)
+    return Model(header=parse_header(data), index=whole_index(data), clouds=decoded_clouds(data, engine))
 
 
 def sphere(

@@ -7,6 +7,8 @@ import math
 import numpy as np
 
 from pointview import snug, splats
+from pointview.render.pack import Packer
+from pointview.render.tables import STEPS
 
 
 def share(index, node, camera):
@@ -49,8 +51,7 @@ class Walk:
     """Looks spacings up in one cut."""
 
     def __init__(self, model, cut, camera):
-        self.camera = camera
-        self.index, self.header = model.index, model.header
+        self.index, self.header, self.model, self.camera = model.index, model.header, model, camera
         self.spacing = dict(zip(cut.nodes.tolist(), cut.spacing.tolist(), strict=True))
         self.wants = set(cut.wants.tolist())
 
@@ -97,6 +98,23 @@ class Walk:
                 spacing = max(spacing, facing)
             here = int(self.index.children[here][half])
         return spacing, starved
+
+    def of_samples(self, node):
+        """Spacings to close at all samples of a drawn node: at their places, or around them where these are thin."""
+        packed = Packer(self.header).pack(self.model.clouds[node], 1 << 16)
+        density, found = self.index.density, []
+        for xyz, code in zip(self.model.positions(node), packed.color[:, 3].tolist(), strict=True):
+            found.append(self.at(node, xyz)[0])
+            if code:
+                full = packed.scale * 2.0 ** (code / STEPS) * np.sqrt(density.own[node])
+                found[-1] = max(found[-1], full / np.sqrt(density.drawn[self.deepest_node(node, xyz)]))
+        return found
+
+    def deepest_node(self, node, xyz):
+        """Deepest drawn node whose cell holds a position in that of a drawn one."""
+        box, axis = cell_of(self.header, path_of(self.index, node))
+        child = int(self.index.children[node][int(xyz[axis] >= box[:, axis].mean())])
+        return self.deepest_node(child, xyz) if child in self.spacing else node
 
     def deepest_everywhere(self, node):
         """The same for all samples of a node that no drawn node refines, if both halves agree."""

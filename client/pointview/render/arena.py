@@ -35,6 +35,8 @@ class Arena:
         Model units of one step of the cloud's coordinates.
     count : (slots,) int64
         Samples.
+    thin : (slots,) bool
+        Whether some are in thin parts of the cloud.
     """
 
     def __init__(self, nodes: int, slots: int) -> None:
@@ -42,6 +44,7 @@ class Arena:
         self.origin = np.zeros((slots, 3))
         self.scale = np.zeros(slots)
         self.count = np.zeros(slots, dtype=np.int64)
+        self.thin = np.zeros(slots, dtype=bool)
         self._slot_of = np.full(nodes, -1, dtype=np.int32)
         self._node_of = np.full(slots, -1, dtype=np.int64)
         self._drawn = np.zeros(slots, dtype=np.int64)  # number of the last call that used the slot
@@ -82,6 +85,7 @@ class Arena:
         self.origin[slot] = cloud.origin
         self.scale[slot] = cloud.scale
         self.count[slot] = len(cloud.vertex)
+        self.thin[slot] = cloud.thin
 
     def slots_of(self, nodes: NDArray[np.int64]) -> Slots:
         """Slots of nodes that are here; -1 for others."""
@@ -102,5 +106,6 @@ class Arena:
         self.origin = np.concatenate([self.origin, np.zeros((more, 3))])
         self.scale = np.concatenate([self.scale, np.zeros(more)])
         self.count = np.concatenate([self.count, np.zeros(more, dtype=np.int64)])
+        self.thin = np.concatenate([self.thin, np.zeros(more, dtype=bool)])
         self._node_of = np.concatenate([self._node_of, np.full(more, -1, dtype=np.int64)])
         self._drawn = np.concatenate([self._drawn, np.zeros(more, dtype=np.int64)])

@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .rules import EMPTY
-
 if TYPE_CHECKING:
     from numpy.typing import DTypeLike, NDArray
 
@@ -24,16 +22,18 @@ class Canvas:
     Attributes
     ----------
     keys : (threads, padded) uint64
-        A key image for each thread: EMPTY, and left so by every frame.
+        A key image for each thread.
     side : (h, w) float32
-        Sides of the splats that are seen; anything where none is.
+        Sides of the splats that are seen.
     holes, sources : (h * w,) int32
         Pixels in holes, and what they show instead.
+
+    All of them hold what the last frame left there.
     """
 
     def __init__(self, height: int, width: int, threads: int, padded: int) -> None:
         self.shape = height, width
-        self.keys = np.full((threads, padded), EMPTY, dtype=np.uint64)
+        self.keys = np.empty((threads, padded), dtype=np.uint64)
         self.side = np.empty((height, width), dtype=np.float32)
         self.holes, self.sources = (np.empty(height * width, dtype=np.int32) for _ in range(2))
         self._free: dict[int, list[NDArray[np.uint8]]] = {}

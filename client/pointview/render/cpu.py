@@ -13,13 +13,13 @@ import numpy as np
 
 from pointview import splats
 
-from . import kernels, picture_kernels, shading, splat_kernels, tables
+from . import kernels, picture_kernels, rules, shading, splat_kernels, tables
 from .arena import Arena
 from .backend import Frame, Style, Take
 from .blending import blend, linear_light
 from .canvas import Canvas
 from .pack import Packer
-from .seen import place_table
+from .seen import look_ups, place_table
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -61,9 +61,9 @@ class CpuBackend:
         """Draw a cut."""
         uploads = self._upload(cut.nodes, take)
         shape = (camera.height, camera.width)
-        canvas, self._canvas = self._canvas, None  # a frame that fails leaves none
-        if canvas is None or canvas.shape != shape:
-            canvas = Canvas(*shape, self._threads, splat_kernels.padded(*shape))
+        if self._canvas is None or self._canvas.shape != shape:
+            self._canvas = Canvas(*shape, self._threads, splat_kernels.padded(*shape))
+        canvas = self._canvas
         words, colors = self._vertex.view(np.uint64).ravel(), self._color.view(np.uint32).ravel()
         clouds, cloud_of_block, row_of_block = self._clouds(cut, camera)
         places, halvings = place_table(cut)
@@ -78,9 +78,10 @@ class CpuBackend:
         background = np.array(style.background, dtype=np.uint8)
 
         def splat(worker: int) -> None:
+            canvas.keys[worker] = rules.EMPTY  # which brings it into the cache, too
             # Every `threads`-th cloud: neighbours in the array are neighbours in space, and cost alike.
             mine = np.ascontiguousarray(clouds[worker :: self._threads])
-            splat_kernels.splat(canvas.keys[worker], words, mine, places, halvings, rotation, view)
+            splat_kernels.splat(canvas.keys[worker], words, colors, mine, places, halvings, rotation, view)
 
         def rows(worker: int) -> tuple[int, int]:
             return camera.height * worker // self._threads, camera.height * (worker + 1) // self._threads
@@ -99,13 +100,13 @@ class CpuBackend:
             largest = min(splats.LARGEST_HOLE, math.ceil(splats.HOLE * widest))
             top, bottom = rows(worker)
             found = picture_kernels.close_holes(
-                depth, side, holes, sources, top, bottom, camera.focal, splats.HOLE, largest, splats.WALLS
-            )
+                depth, side, holes, sources, top, bottom, camera.focal,
+                splats.HOLE, largest, splats.WALLS, splats.FACES, splats.FACE,
+            )  # fmt: skip
             return slice(top * camera.width, top * camera.width + found)
 
         self._in_parallel(splat)
         widest = max(self._in_parallel(resolve))
-        self._canvas = canvas
         if style.close_holes:
             found = self._in_parallel(find)
             into, out_of = (np.concatenate([pixels[part] for part in found]) for pixels in (holes, sources))
@@ -168,9 +169,10 @@ class CpuBackend:
         clouds["x"], clouds["y"], clouds["z"] = offset.T
         clouds["scale"] = self._arena.scale[slots]
         clouds["spacing"], clouds["starved"] = cut.spacing, cut.starved
-        clouds["row"], clouds["level"] = np.arange(len(slots)), -1
+        clouds["row"], clouds["thin"] = np.arange(len(slots)), self._arena.thin[slots]
+        clouds["level"] = look_ups(cut, slice(None), self._arena.thin[slots])
         if cut.places is not None:
-            clouds["level"] = cut.places.level
+            clouds["alone"] = self._arena.scale[slots] * cut.places.alone
             corner = self._arena.origin[slots] - cut.places.corner
             clouds["corner_x"], clouds["corner_y"], clouds["corner_z"] = corner.T
         cloud_of_block = np.repeat(np.arange(len(slots), dtype=np.int32), blocks)

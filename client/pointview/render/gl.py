@@ -25,6 +25,8 @@ from .backend import Frame, Style, Take
 from .blending import LEAST
 from .gl_memory import COMMANDS_FROM, PLACEMENT, Buffers, Memory, Textures
 from .pack import SAMPLE_BYTES, Packer
+from .seen import look_ups
+from .tables import STEPS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -188,6 +190,7 @@ class GlBackend:
             "two_sided": style.two_sided,
             "places": PLACES_UNIT,
             "levels": 0 if cut.places is None else len(cut.places.axis),
+            "spreads": 0 if cut.places is None else len(cut.places.axis) + len(cut.places.link),
         }
 
     def _upload(self, nodes: NDArray[np.int64], take: Take) -> int:
@@ -203,11 +206,11 @@ class GlBackend:
         return len(absent)
 
     def _write_places(self, cut: Cut) -> None:
-        """Give the vertex shader the places of a cut: halvings (axis, half), then nodes (links, spacings)."""
+        """Give the vertex shader the places of a cut: halvings (axis, half), nodes (links, spacings), spreads."""
         if cut.places is None:
             return
         levels, count = len(cut.places.axis), len(cut.places.link)
-        rows = -(-(levels + count) // PLACES_WIDTH)
+        rows = -(-(levels + count + -(-count // 4)) // PLACES_WIDTH)
         if self._places.height < rows:
             self._places.release()
             self._places = self._context.texture((PLACES_WIDTH, 1 << (rows - 1).bit_length()), 4, dtype="f4")
@@ -215,6 +218,7 @@ class GlBackend:
         texels[:levels, 0], texels[:levels, 1] = cut.places.axis, cut.places.half
         texels[levels : levels + count, :2] = cut.places.link
         texels[levels : levels + count, 2:] = cut.places.spacing
+        texels.reshape(-1)[4 * (levels + count) :][:count] = cut.places.spread
         self._places.write(texels, viewport=(0, 0, PLACES_WIDTH, rows))
         self._places.use(PLACES_UNIT)
 
@@ -228,10 +232,11 @@ class GlBackend:
         placement["side"] = cut.spacing[part] * (splats.CLOSING * camera.focal)
         placement["node"], placement["count"] = nodes, self._arena.count[slots]
         placement["row"] = np.arange(part.start, part.start + len(nodes)) + cut.starved[part] * STARVED
-        placement["level"] = -1
+        placement["level"] = look_ups(cut, part, self._arena.thin[slots])
         if cut.places is not None:
-            placement["level"] = cut.places.level[part]
             placement["corner"] = self._arena.origin[slots] - cut.places.corner[part]
+            alone = self._arena.scale[slots] * cut.places.alone[part]
+            placement["side"] = np.where(placement["level"] < 0, placement["side"], alone)
         self._memory.draw(samples.points, slots, placement)
 
     def _close_holes(self, layers: _Layers, camera: Camera) -> _Layers:
@@ -346,11 +351,11 @@ def _shader(name: str, defines: str = "") -> str:
     """Text of a shader: GLSL with the constants of `splats` and `shading` for @NAME@."""
     text = (files(__package__) / "shaders" / name).read_text(encoding="utf-8")
     kinds = "".join(f"#define {kind} {number}\n" for number, kind in enumerate(("POINT", "SQUARE", "BALL", "DISC")))
-    constants = {**vars(splats), **vars(shading), "EMPTY": EMPTY, "LEAST": LEAST}
+    constants = {**vars(splats), **vars(shading), "EMPTY": EMPTY, "LEAST": LEAST, "STEPS": STEPS}
 
     def constant(match: re.Match[str]) -> str:
         value = constants[match[1]]
-        return str(value) if match[1] in ("WALLS", "LARGEST_HOLE") else f"{float(value):.9e}"
+        return str(value) if match[1] in ("WALLS", "FACES", "LARGEST_HOLE") else f"{float(value):.9e}"
 
     return f"#version 330\n{defines}{kinds}{re.sub('@([A-Z_]+)@', constant, text)}"
 

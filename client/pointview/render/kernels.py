@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numba
 import numpy as np
 
-from .rules import EMPTY, F, direction, plane_of, spacing_at, x_of, y_of, z_of
+from .rules import EMPTY, F, direction, plane_of, spacing_at, spacing_in, x_of, y_of, z_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -55,8 +55,8 @@ def resolve(
 ) -> np.float32:  # pragma: no cover - compiled
     """Colour, depth, node, side and starvation of the rows `top` to `bottom` from the key images (threads, padded).
 
-    Leaves the key images empty, and the sides of pixels that show nothing as they were. A row at a time: the samples
-    are gathered, which waits for memory, and then lit, which vector instructions do.
+    Leaves the sides of pixels that show nothing as they were. A row at a time: the samples are gathered, which waits
+    for memory, and then lit, which vector instructions do.
 
     Returns
     -------
@@ -72,8 +72,9 @@ def resolve(
     here, across = np.empty(width, dtype=np.float32), np.empty(width, dtype=np.float32)
     blank, largest = np.empty((width, 3), dtype=np.uint8), F(0.0)
     blank[:] = background
+    blank_line = blank.reshape(3 * width)
     for row in range(top, bottom):
-        rgb[row], depth[row], node[row], starved[row] = blank, np.inf, -1, False
+        _clear(rgb[row].reshape(3 * width), depth[row], node[row], starved[row], blank_line)
         count = _covered(nearest, column_of, layers, row * width)
         for k in range(count):  # nothing but loads, many at a time on their way
             place = np.uint32(nearest[k])
@@ -88,10 +89,11 @@ def resolve(
             code[k] = np.int32(word[k] >> np.uint64(48))
             spacing, hungry = cloud.spacing, cloud.starved
             if cloud.level >= 0:
+                full = spacing_in(cloud, color[k] >> np.uint32(24))
                 inside_x = cloud.corner_x + cloud.scale * x_of(word[k])
                 inside_y = cloud.corner_y + cloud.scale * y_of(word[k])
                 inside_z = cloud.corner_z + cloud.scale * z_of(word[k])
-                spacing, hungry = spacing_at(cloud, inside_x, inside_y, inside_z, view.reach, places, halvings)
+                spacing, hungry = spacing_at(cloud, inside_x, inside_y, inside_z, view.reach, full, places, halvings)
             across[k] = spacing
             node[row, column_of[k]], starved[row, column_of[k]] = cloud.node, hungry
         _measure(here[:count], across, x, y, z, rotation, view)
@@ -110,16 +112,34 @@ def resolve(
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def _clear(
+    line: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    node: NDArray[np.int32],
+    starved: NDArray[np.bool_],
+    blank: NDArray[np.uint8],
+) -> None:  # pragma: no cover - compiled
+    """Fill a row of pixels with what is seen of nothing: in loops, which are compiled better than assignments."""
+    for i in range(len(line)):
+        line[i] = blank[i]
+    for i in range(len(depth)):
+        depth[i] = F(np.inf)
+    for i in range(len(node)):
+        node[i] = np.int32(-1)
+    for i in range(len(starved)):
+        starved[i] = False
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def _covered(
     nearest: NDArray[np.uint64], columns: NDArray[np.int32], layers: NDArray[np.uint64], start: int
 ) -> int:  # pragma: no cover - compiled
-    """List the keys of a row of pixels, and their columns; return how many they are. Leaves the row empty."""
+    """List the keys of a row of pixels, and their columns; return how many they are. Merges the row into one image."""
     width, keys = len(nearest), layers[0, start:]
     for layer in range(1, len(layers)):
         others = layers[layer, start:]
         for column in range(width):
             keys[column] = min(keys[column], others[column])
-            others[column] = EMPTY
     count = 0
     for first in range(0, width, RUN):
         end, least = min(first + RUN, width), EMPTY
@@ -130,7 +150,6 @@ def _covered(
         for column in range(first, end):
             nearest[count], columns[count] = keys[column], column
             count += keys[column] != EMPTY
-            keys[column] = EMPTY
     return count
 
 
@@ -216,7 +235,6 @@ def seen(
     count = 0
     for c in range(len(clouds)):
         cloud = clouds[c]
-        spacing = cloud.spacing
         for i in range(cloud.first, cloud.first + cloud.count):
             x = cloud.x + cloud.scale * F(vertex[i, 0])
             y = cloud.y + cloud.scale * F(vertex[i, 1])
@@ -229,11 +247,13 @@ def seen(
                 nx, ny, nz = direction(code)
                 if nx * x + ny * y + nz * z > F(0.0):
                     continue
+            spacing = cloud.spacing
             if cloud.level >= 0:
+                full = spacing_in(cloud, color[i, 3])
                 inside_x = cloud.corner_x + cloud.scale * F(vertex[i, 0])
                 inside_y = cloud.corner_y + cloud.scale * F(vertex[i, 1])
                 inside_z = cloud.corner_z + cloud.scale * F(vertex[i, 2])
-                spacing, _ = spacing_at(cloud, inside_x, inside_y, inside_z, view.reach, places, halvings)
+                spacing, _ = spacing_at(cloud, inside_x, inside_y, inside_z, view.reach, full, places, halvings)
             right = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
             up = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
             plane = (F(0.0), F(0.0), F(-1.0))

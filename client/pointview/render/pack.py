@@ -3,7 +3,8 @@
     u16 x, y, z     position inside the cloud, in steps of `scale` from `origin`
     u16 normal      two octahedral bytes, the first in the low byte; 0: none. Of a model without normals that of the
                     sample's plane (`planes`), of either sign
-    u8  r, g, b, -  colour; white where the model has none
+    u8  r, g, b     colour; white where the model has none
+    u8  spacing     of the cloud's samples around this one, where it is in a thin part of the cloud (`thin`); 0: no
 
 The same bytes feed the CPU kernels and OpenGL's vertex fetch.
 """
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .planes import planes
+from .thin import thin
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -40,12 +42,15 @@ class PackedCloud:
         Model space position of (0, 0, 0).
     scale : float
         Model units of one step.
+    thin : bool
+        Whether some samples have a spacing of their own.
     """
 
     vertex: NDArray[np.uint16]
     color: NDArray[np.uint8]
     origin: NDArray[np.float64]
     scale: float
+    thin: bool
 
 
 class Packer:
@@ -77,10 +82,13 @@ class Packer:
         color = np.full((count, 4), 255, dtype=np.uint8)
         if self._color is not None and self._color.name in cloud.codes:
             color[:, :3] = _color_bytes(cloud.codes[self._color.name][:count], self._color)
+        color[:, 3] = thin(vertex[:, :3], vertex[:, 3])
         cell = 2.0**cloud.shift
         dropped = (cell - 1) / 2  # the low bits that are not drawn, on average
         origin = self._origin + self._step * (cloud.origin.astype(np.float64) + dropped)
-        return PackedCloud(vertex=vertex, color=color, origin=origin, scale=self._step * cell)
+        return PackedCloud(
+            vertex=vertex, color=color, origin=origin, scale=self._step * cell, thin=bool(color[:, 3].any())
+        )
 
 
 def _find(header: Header, kind: str) -> Attribute | None:

@@ -83,6 +83,8 @@ def close_holes(
     reach: float,
     largest: int,
     walls: int,
+    faces: int,
+    face: float,
 ) -> int:  # pragma: no cover - compiled
     """Find the pixels of the rows `top` to `bottom` that lie in holes, and the walls that they show instead.
 
@@ -97,6 +99,8 @@ def close_holes(
         And at most this many pixels.
     walls : int
         Directions, of eight, in which a hole has walls.
+    faces, face : int, float
+        In so many of these a wall goes on into the hole, by its slope over so many sides of its splat.
 
     Returns
     -------
@@ -107,7 +111,7 @@ def close_holes(
     first = count = top * width
     if largest == 0:
         return 0
-    deep = np.empty((BAND, width), dtype=np.float32)
+    deep, away = np.empty((BAND, width), dtype=np.float32), np.empty(8, dtype=np.int32)
     for row in range(top, bottom):
         if (row - top) % BAND == 0:
             _between_walls(deep, depth, side, row, focal, largest)
@@ -115,12 +119,12 @@ def close_holes(
             here = depth[row, column]
             if not deep[(row - top) % BAND, column] < here:
                 continue
-            best, nearest, found = row * width + column, largest + 1, 0
+            found = 0
             for direction in range(8):
                 if found + 8 - direction < walls:
                     break
                 dx, dy = DIRECTIONS[direction]
-                step = 1
+                step, away[direction] = 1, 0
                 while step <= largest:
                     x, y = column + step * dx, row + step * dy
                     if x < 0 or x >= width or y < 0 or y >= height:
@@ -130,14 +134,50 @@ def close_holes(
                         wide = side[y, x]
                         if step <= max(F(reach) * wide, F(1.0)) and wall * (F(1.0) + wide / F(focal)) < here:
                             found += 1
-                            if step < nearest:
-                                nearest, best = step, y * width + x
+                            away[direction] = step
                             break
                     step += 1 if step < 4 else step // 2
-            if found >= walls:
+            if found < walls:
+                continue
+            best, nearest, level = row * width + column, largest + 1, 0
+            for direction in range(8):
+                step = away[direction]
+                if step == 1 or (step > 0 and _goes_on(depth, side, row, column, direction, step, focal, reach, face)):
+                    level += 1
+                    if step < nearest:
+                        dx, dy = DIRECTIONS[direction]
+                        nearest, best = step, (row + step * dy) * width + column + step * dx
+                    if nearest == 1 and level >= faces:
+                        break
+            if level >= faces:
                 holes[count], sources[count] = row * width + column, best
                 count += 1
     return count - first
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _goes_on(
+    depth: NDArray[np.float32],
+    side: NDArray[np.float32],
+    row: int,
+    column: int,
+    direction: int,
+    step: int,
+    focal: float,
+    reach: float,
+    face: float,
+) -> bool:  # pragma: no cover - compiled
+    """Whether the plane of a wall reaches the pixel that it is so many steps away from, more than one."""
+    dx, dy = DIRECTIONS[direction]
+    x, y = column + step * dx, row + step * dy
+    wall, wide = depth[y, x], side[y, x]
+    ahead, slope = max(int(F(face) * wide + F(0.5)), 1), F(0.0)
+    x_ahead, y_ahead = x + ahead * dx, y + ahead * dy
+    if x_ahead >= 0 and x_ahead < depth.shape[1] and y_ahead >= 0 and y_ahead < len(depth):
+        slope = (depth[y_ahead, x_ahead] / wall - F(1.0)) * F(focal) / F(ahead)
+        slope = slope if slope < np.inf else F(0.0)
+    away = F(step * step) * (F(dx * dx + dy * dy) + slope * slope)
+    return away <= F(reach) * wide * F(reach) * wide
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

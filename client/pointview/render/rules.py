@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numba
 import numpy as np
 
+from .tables import STEPS
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -85,6 +87,12 @@ def plane_of(
     return F(nx * length), F(ny * length), F(nz * length)
 
 
+@numba.njit(nogil=True, cache=True, inline="always")
+def spacing_in(cloud: Any, code: np.uint32 | np.uint8) -> np.float32:  # pragma: no cover - compiled
+    """Spacing of all of the model's samples around a sample of a code of `thin`, as far as the cloud tells; 0: none."""
+    return cloud.alone * math.exp2(F(code) * F(1.0 / STEPS)) if code > 0 else F(0.0)
+
+
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def facing(
     row: int, level: int, x: np.float32, y: np.float32, z: np.float32, places: NDArray[Any], halvings: NDArray[Any]
@@ -115,10 +123,14 @@ def spacing_at(
     y: np.float32,
     z: np.float32,
     reach: np.float32,
+    full: np.float32,
     places: NDArray[Any],
     halvings: NDArray[Any],
 ) -> tuple[np.float32, bool]:  # pragma: no cover - compiled
-    """Spacing to close at a sample of the cloud, and whether its place is starved; the sample relative to `corner`."""
+    """Spacing to close at a sample of the cloud, and whether its place is starved; the sample relative to `corner`.
+
+    `full` is the spacing of all of the model's samples around it, where it is known (see `spacing_in`).
+    """
     row, level, coarsest = cloud.row, cloud.level, F(0.0)
     while True:
         axis, half, place = halvings[level].axis, halvings[level].half, places[row]
@@ -146,7 +158,7 @@ def spacing_at(
             if apart < reach * other:
                 coarsest = max(coarsest, other)
         if row < 0:
-            return max(abs(spacing), coarsest), spacing < F(0.0)
+            return max(abs(spacing), coarsest, full * place.spread), spacing < F(0.0)
         if above:
             if axis == 0:
                 x -= half

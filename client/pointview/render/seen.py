@@ -23,9 +23,25 @@ def place_table(cut: Cut) -> tuple[NDArray[Any], NDArray[Any]]:
     places = np.empty(len(cut.places.link), dtype=PLACE)
     places["lower"], places["upper"] = cut.places.link.T
     places["lower_spacing"], places["upper_spacing"] = cut.places.spacing.T
+    places["spread"] = cut.places.spread
     halvings = np.empty(len(cut.places.axis), dtype=HALVING)
     halvings["axis"], halvings["half"] = cut.places.axis, cut.places.half
     return places, halvings
+
+
+def look_ups(cut: Cut, part: slice, thin: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Levels of the nodes whose samples look up how large they are, each its own size; -1 for nodes of one spacing.
+
+    Parameters
+    ----------
+    part : slice
+        Which nodes of the cut.
+    thin : (n,) bool
+        Whether some of their samples are in thin parts of the cloud.
+    """
+    if cut.places is None:
+        return np.full(len(thin), -1, dtype=np.int32)
+    return np.where(cut.places.uniform[part] & ~thin, np.int32(-1), cut.places.level[part])
 
 
 def pixels_by_cell(depth: NDArray[np.float32], cut: Cut, camera: Camera, *, stride: int = 1) -> NDArray[np.int64]:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numba
 import numpy as np
 
-from .rules import EMPTY, F, direction, key_of, plane_of, spacing_at, x_of, y_of, z_of
+from .rules import EMPTY, F, direction, key_of, plane_of, spacing_at, spacing_in, x_of, y_of, z_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -131,7 +131,7 @@ def _disc(
                 apart = dx * dx + dy * dy + dz * dz
                 covered = (apart <= reach) & (t > F(0.0)) & (column < end) & (row < bottom)
                 block[k] = key_of(t + bulge * apart, place) if covered else EMPTY
-            _write(keys, block, bits, np.int32(view.width), np.int32(upper), np.int32(near))
+            _write(keys, block, bits, np.int32(view.width), np.int32(upper), bottom, np.int32(near))
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
@@ -160,19 +160,25 @@ def _ball(
                 apart = dx * dx + dy * dy
                 covered = (apart <= reach) & (column < end) & (row < bottom)
                 block[k] = key_of(depth + bulge * apart, place) if covered else EMPTY
-            _write(keys, block, bits, np.int32(view.width), np.int32(upper), np.int32(near))
+            _write(keys, block, bits, np.int32(view.width), np.int32(upper), bottom, np.int32(near))
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _write(
-    keys: NDArray[np.uint64], block: NDArray[np.uint64], bits: np.int32, width: np.int32, top: np.int32, left: np.int32
+    keys: NDArray[np.uint64],
+    block: NDArray[np.uint64],
+    bits: np.int32,
+    width: np.int32,
+    top: np.int32,
+    bottom: np.int32,
+    left: np.int32,
 ) -> None:  # pragma: no cover - compiled
     """Keep the smaller of the keys in a block of pixels and those there."""
     start = top * width + left
-    for k in range(BLOCK):
-        down, across = np.int32(k) >> bits, np.int32(k) & ((np.int32(1) << bits) - np.int32(1))
-        spot = np.uint32(start + down * width + across)
-        keys[spot] = min(keys[spot], block[k])
+    for row in range(min(bottom - top, np.int32(BLOCK >> bits))):
+        line, own = keys[np.uint32(start + row * width) :], block[np.uint32(row << bits) :]
+        for column in range(1 << bits):
+            line[column] = min(line[column], own[column])
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -280,7 +286,8 @@ def _fill(
         if rows[i] == 0:
             continue
         key, start = key_of(depths[i], place + i), top[i] * width + left[i]
-        for row in range(highest):
+        # Two rows cost less than a branch on whether it is one, three do not.
+        for row in range(rows[i] if highest > 2 else highest):
             for column in range(widest):
                 spot = np.uint32(start + row * width + column)
                 inside = (row < rows[i]) & (column < columns[i])
@@ -291,6 +298,7 @@ def _fill(
 def splat(
     keys: NDArray[np.uint64],
     words: NDArray[np.uint64],
+    colors: NDArray[np.uint32],
     clouds: NDArray[Any],
     places: NDArray[Any],
     halvings: NDArray[Any],
@@ -305,6 +313,8 @@ def splat(
         EMPTY, or what earlier calls left; see `padded`.
     words : (n,) uint64
         x, y, z, normal: 16 bits each, the first in the lowest.
+    colors : (n,) uint32
+        Of which the code of `thin` is looked at, the highest byte.
     clouds : (k,) CLOUD
     places : (n,) PLACE
     halvings : (levels,) HALVING
@@ -334,7 +344,8 @@ def splat(
                         x = cloud.corner_x + cloud.scale * x_of(batch[i])
                         y = cloud.corner_y + cloud.scale * y_of(batch[i])
                         z = cloud.corner_z + cloud.scale * z_of(batch[i])
-                        spacing, _ = spacing_at(cloud, x, y, z, view.reach, places, halvings)
+                        full = spacing_in(cloud, colors[first + i] >> np.uint32(24)) if cloud.thin else F(0.0)
+                        spacing, _ = spacing_at(cloud, x, y, z, view.reach, full, places, halvings)
                         sides[i] = min(spacing * view.closing * (F(1.0) / depths[i]), view.largest)
             _box(left, top, columns, rows, px[:count], py, sides, view)
             _fill(keys, int(width), int(place), depths, left, top, columns[:count], rows[:count])

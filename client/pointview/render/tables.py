@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+STEPS = 16
+"""Codes of `thin` to a doubling of the spacing."""
+
 CLOUD = np.dtype(
     [
         ("node", np.int32),
@@ -14,13 +17,15 @@ CLOUD = np.dtype(
         ("y", np.float32),
         ("z", np.float32),
         ("scale", np.float32),  # model units of a step
-        ("spacing", np.float32),  # to close, model units; the next five say where it differs inside the cloud
+        ("spacing", np.float32),  # to close, model units; the next say where it differs inside the cloud
         ("starved", np.bool_),
         ("row", np.int32),  # of its node in PLACE
-        ("level", np.int32),  # of its node; -1 where the spacing is the same everywhere
+        ("level", np.int32),  # of its node; -1 where all samples close the spacing above
         ("corner_x", np.float32),  # position of the cloud's (0, 0, 0) relative to the corner of its node's cell
         ("corner_y", np.float32),
         ("corner_z", np.float32),
+        ("thin", np.bool_),  # whether samples have a spacing of their own; see `thin`
+        ("alone", np.float32),  # model units of a step, times what `places` says of the node's own samples
     ]
 )
 """A cloud of the frame."""
@@ -31,6 +36,7 @@ PLACE = np.dtype(
         ("upper", np.int32),
         ("lower_spacing", np.float32),  # to close there; negative where starved
         ("upper_spacing", np.float32),
+        ("spread", np.float32),  # see `places`
     ]
 )
 """A drawn node (see `places`)."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from lpc.info import counted
 from pointstream.arguments import Number
 from pointview.arguments import TOLERANCE, PathType, SizeType, ViewType, read_link
 
@@ -118,7 +119,7 @@ def stream(
     use = "no limit" if result.link_utilisation is None else f"{100 * result.link_utilisation:.1f} %"
     click.echo(f"first picture   {first}")
     click.echo(f"settled         {settled}")
-    click.echo(f"received        {result.bytes:,} bytes in {result.requests} requests")
+    click.echo(f"received        {result.bytes:,} bytes in {counted(result.requests, 'request')}")
     click.echo(f"link used       {use}")
     if result.speculative_bytes:
         click.echo(f"fetched ahead   {result.speculative_bytes:,} bytes, {result.wasted_bytes:,} of them never drawn")

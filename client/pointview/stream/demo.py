@@ -94,7 +94,8 @@ def _five_figures(result: dict[str, Any]) -> Iterator[str]:
     yield f"  view complete            {settled:>12}   settled_s"
     yield f"  {error:<25}{psnr:>12}   curve[].psnr_db, SSIM {ten['ssim']:.3f}"
     yield f"  link carrying payload    {use:>12}   link_utilisation"
-    yield f"  received                 {result['bytes'] / 1e6:>9.2f} MB   bytes, in {result['requests']} requests"
+    requests = counted(result["requests"], "request")
+    yield f"  received                 {result['bytes'] / 1e6:>9.2f} MB   bytes, in {requests}"
 
 
 def _announce(*arguments: str) -> Iterator[str]:

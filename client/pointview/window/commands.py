@@ -20,7 +20,10 @@ if TYPE_CHECKING:
     from .inputs import Inputs
     from .viewer import Viewer
 
-SCANS = (".ply", ".las", ".laz", ".e57", ".pcd", ".xyz", ".csv", ".txt", ".pts", ".ptx", ".obj")
+SCANS = (
+    ".ply", ".las", ".laz", ".e57", ".pcd", ".npz", ".obj", ".xyz", ".pts", ".csv", ".txt", ".asc", ".xyzrgb", ".xyzn",
+)  # fmt: skip
+"""Suffixes of what `pointstream build` reads."""
 
 
 def obey(viewer: Viewer, did: Inputs) -> None:

@@ -91,7 +91,7 @@ def run_loop(
             screen.blank()
         screen.rename(viewer.title)
         panel.draw(viewer, screen.renderer)
-        Overlay.beside(inset).show(viewer)
+        Overlay.beside(inset, panel.width(viewer.settings, screen.letters)).show(viewer)
         screen.end()
         ended = clock()
         frames += 1

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 AXES = (("x", (232, 92, 84)), ("y", (112, 190, 92)), ("z", (96, 148, 240)))
 TEXT, SHADE, YELLOW, RED = (230, 230, 230), (18, 21, 26), (255, 214, 10), (232, 64, 56)
 
+PLATE = 140
+"""Of 255: how much what is always there darkens the picture behind it."""
+
 PREPARING = "getting ready to draw ... (some seconds at the first use after an installation)"
 WELCOME = "Drop a model here, or paste its path or address with Ctrl V"
 
@@ -29,7 +32,9 @@ class Overlay:
     Parameters
     ----------
     left, right, bottom : float
-        Edges; the upper one is 0.
+        Edges of the picture; the upper one is 0.
+    clear : float
+        Where the panel ends, which stands on the picture in a narrow window.
     letter : float
         Height of letters.
     draw : draw list
@@ -37,23 +42,29 @@ class Overlay:
     """
 
     left: float
+    clear: float
     right: float
     bottom: float
     letter: float
     draw: Any
 
     @classmethod
-    def beside(cls, inset: float) -> Overlay:
+    def beside(cls, inset: float, panel: float) -> Overlay:
         """Return that of this frame.
 
         Parameters
         ----------
-        inset : float
-            What the panel takes, in heights of letters.
+        inset, panel : float
+            What the panel takes of the window, and how wide it is, in heights of letters.
         """
         size, letter = imgui.get_io().display_size, imgui.get_font_size()
         return cls(
-            left=inset * letter, right=size.x, bottom=size.y, letter=letter, draw=imgui.get_background_draw_list()
+            left=inset * letter,
+            clear=panel * letter,
+            right=size.x,
+            bottom=size.y,
+            letter=letter,
+            draw=imgui.get_background_draw_list(),
         )
 
     def show(self, viewer: Viewer) -> None:
@@ -84,7 +95,8 @@ class Overlay:
     def _axes(self, view: Viewpoint) -> None:
         """Draw where x, y and z point, the farthest first."""
         right, up, forward = view.camera.rotation()
-        x, y, arm = self.left + 3.2 * self.letter, self.bottom - 3.2 * self.letter, 2.0 * self.letter
+        x, y, arm = self.clear + 3.6 * self.letter, self.bottom - 3.6 * self.letter, 2.0 * self.letter
+        self.draw.add_circle_filled((x, y), 1.65 * arm, _packed(SHADE, PLATE))
         for axis in sorted(range(3), key=lambda axis: -forward[axis]):
             name, color = AXES[axis]
             tip = (x + arm * float(right[axis]), y - arm * float(up[axis]))
@@ -100,14 +112,17 @@ class Overlay:
         if depth <= 0:
             return
         pixels = view.camera.focal / depth / max(imgui.get_io().display_framebuffer_scale.x, 1e-3)
-        length = tidy_length(0.25 * (self.right - self.left) / pixels)
+        length = tidy_length(0.25 * (self.right - self.clear) / pixels)
         text, width = written_length(length, unit), length * pixels
         right, y = self.right - self.letter, self.bottom - 1.2 * self.letter
+        size = imgui.calc_text_size(text)
+        wide, high = max(width, size.x), size.y + self.letter
+        left = right - width / 2 - wide / 2
+        self._box(left - self.letter / 2, y - high, left + wide + self.letter / 2, y + self.letter * 0.7, PLATE)
         for color, thick in ((SHADE, self.letter / 3), (TEXT, self.letter / 8)):
             self.draw.add_line((right - width, y), (right, y), _packed(color), thick)
             for x in (right - width, right):
                 self.draw.add_line((x, y - self.letter / 3), (x, y + self.letter / 3), _packed(color), thick)
-        size = imgui.calc_text_size(text)
         self._text(right - width / 2 - size.x / 2, y - size.y - self.letter / 3, text)
 
     def _pivot(self, view: Viewpoint) -> None:
@@ -151,32 +166,36 @@ class Overlay:
             self.draw.add_text((left + 1.6 * letter, y), _packed(TEXT), text)
 
     def _recording(self, seconds: float) -> None:
-        x, y = self.left + self.letter, self.letter
+        x, y, text = self.clear + 1.5 * self.letter, self.letter, f"recording, {seconds:.0f} s"
+        edge = x + 1.4 * self.letter + imgui.calc_text_size(text).x
+        self._box(x - self.letter / 2, y - self.letter / 2, edge + self.letter / 2, y + 1.5 * self.letter)
         self.draw.add_circle_filled((x + self.letter / 2, y + self.letter / 2), 0.4 * self.letter, _packed(RED))
-        self._text(x + 1.4 * self.letter, y, f"recording, {seconds:.0f} s")
+        self._text(x + 1.4 * self.letter, y, text)
 
     def _notice(self, text: str) -> None:
         """Write in the middle of a window without a picture."""
-        wrap = 0.9 * (self.right - self.left)
+        wrap = 0.9 * (self.right - self.clear)
         size = imgui.calc_text_size(text, False, wrap)
-        x, y = (self.left + self.right - size.x) / 2, (self.bottom - size.y) / 2
+        x, y = (self.clear + self.right - size.x) / 2, (self.bottom - size.y) / 2
         self.draw.add_text(imgui.get_font(), self.letter, (x, y), _packed(TEXT), text, wrap)
 
     def _message(self, text: str) -> None:
         """Write at the upper edge."""
-        wrap = 0.55 * (self.right - self.left)
+        wrap = max(0.55 * (self.right - self.clear), 14 * self.letter)
         size = imgui.calc_text_size(text, False, wrap)
-        x, y = self.left + 1.5 * self.letter, 2.8 * self.letter
+        x, y = self.clear + 1.5 * self.letter, 3.4 * self.letter
         self._box(x - self.letter / 2, y - self.letter / 2, x + size.x + self.letter / 2, y + size.y + self.letter / 2)
         self.draw.add_text(imgui.get_font(), self.letter, (x, y), _packed(TEXT), text, wrap)
 
     def _load_bar(self, here: int, whole: int) -> None:
         """Draw how much of the view is here, along the lower edge."""
-        width, top = self.right - self.left, self.bottom - self.letter / 3
-        self.draw.add_rect_filled((self.left, top), (self.right, self.bottom), _packed((60, 64, 72)))
-        self.draw.add_rect_filled((self.left, top), (self.left + width * here / whole, self.bottom), _packed(YELLOW))
+        width, top = self.right - self.clear, self.bottom - self.letter / 3
+        self.draw.add_rect_filled((self.clear, top), (self.right, self.bottom), _packed((60, 64, 72)))
+        self.draw.add_rect_filled((self.clear, top), (self.clear + width * here / whole, self.bottom), _packed(YELLOW))
         text = f"{written_bytes(here)} of {written_bytes(whole)}"
-        self._text(self.left + width / 2 - imgui.calc_text_size(text).x / 2, top - 1.3 * self.letter, text)
+        half, x, y = imgui.calc_text_size(text).x / 2, self.clear + width / 2, top - 1.5 * self.letter
+        self._box(x - half - self.letter / 2, y - self.letter / 4, x + half + self.letter / 2, top, PLATE)
+        self._text(x - half, y, text)
 
     def _text(self, x: float, y: float, text: str, color: tuple[int, ...] = TEXT) -> None:
         """Write on whatever colour."""
@@ -184,8 +203,9 @@ class Overlay:
             self.draw.add_text((x + dx, y + dy), _packed(SHADE), text)
         self.draw.add_text((x, y), _packed(color), text)
 
-    def _box(self, left: float, top: float, right: float, bottom: float) -> None:
-        self.draw.add_rect_filled((left, top), (right, bottom), _packed(SHADE, 210), self.letter / 4)
+    def _box(self, left: float, top: float, right: float, bottom: float, alpha: int = 210) -> None:
+        """Darken the picture behind what is written there."""
+        self.draw.add_rect_filled((left, top), (right, bottom), _packed(SHADE, alpha), self.letter / 4)
 
 
 def written_bytes(count: float) -> str:

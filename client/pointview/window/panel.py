@@ -7,15 +7,19 @@ from typing import TYPE_CHECKING, get_args
 
 from imgui_bundle import imgui
 
+from lpc.info import counted
 from pointview.colouring import Mode, available_modes
 from pointview.render import Splat
 
 from .inputs import AXES, KEYS
 from .overlay import written_bytes
+from .scales import written_place
 from .settings import BUDGETS, TOLERANCES, Settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
+    from pointview.refine import Culled
 
     from .viewer import Viewer
 
@@ -52,6 +56,11 @@ class Panel:
     commands: frozenset[str] = frozenset()
 
     @staticmethod
+    def width(settings: Settings, window: float) -> float:
+        """Return how wide it is, in heights of its letters."""
+        return WIDTH if settings.panel and window >= ROOM * WIDTH else 0.0
+
+    @staticmethod
     def inset(settings: Settings, window: float) -> float:
         """Return what the panel takes of a window on its left, in heights of its letters."""
         return WIDTH if settings.panel and window >= BESIDE * WIDTH else 0.0
@@ -60,7 +69,7 @@ class Panel:
         """Write one frame of it."""
         self.commands = frozenset()
         settings, window = viewer.settings, imgui.get_io().display_size.x / imgui.get_font_size()
-        if settings.panel and window >= ROOM * WIDTH:
+        if self.width(settings, window):
             self._settings(viewer, renderer)
         if settings.help:
             _help(settings, self.inset(settings, window))
@@ -166,11 +175,10 @@ def _statistics(viewer: Viewer, renderer: str) -> None:
     rows: list[tuple[str, str]] = []
     cut, frame, stats = viewer.cut, viewer.frame, None if viewer.feed is None else viewer.feed.stats
     if cut is not None and frame is not None:
-        culled = cut.culled
         rows += [
             ("splats", f"{frame.splats:,}"),
             ("clouds", f"{frame.clouds:,}, {int(cut.starved.sum()):,} lack data"),
-            ("left out", f"{culled.frustum:,} outside, {culled.backface:,} away, {culled.occluded:,} hidden"),
+            ("left out", _left_out(cut.culled)),
             ("coarsest", f"{cut.max_spacing_px:.2f} px"),
             ("drawn in", f"{1e3 * viewer.drawing:.0f} ms, {viewer.painter.name.partition(' ')[0]}"),
         ]
@@ -178,13 +186,13 @@ def _statistics(viewer: Viewer, renderer: str) -> None:
         rtt = "" if stats.rtt is None else f", {1e3 * stats.rtt:.0f} ms"
         rows += [
             ("line", "a file" if stats.goodput is None else f"{written_bytes(stats.goodput)}/s{rtt}"),
-            ("received", f"{written_bytes(stats.bytes_received)}, {stats.requests:,} requests"),
+            ("received", f"{written_bytes(stats.bytes_received)}, {counted(stats.requests, 'request')}"),
             ("ahead", f"{written_bytes(stats.speculative_bytes)}, {written_bytes(stats.wasted_bytes)} not drawn"),
-            ("in memory", f"{stats.resident_clouds:,} clouds, {written_bytes(stats.resident_bytes)}"),
+            ("in memory", f"{counted(stats.resident_clouds, 'cloud')}, {written_bytes(stats.resident_bytes)}"),
         ]
         rows += [("trouble", f"{error.text} ({error.count} times)") for error in stats.errors[:3]]
     if viewer.view is not None:
-        rows.append(("turns around", ", ".join(f"{value:.7g}" for value in viewer.view.pivot)))
+        rows.append(("turns around", written_place(viewer.view.pivot, viewer.mirror.header.bounds)))
     if imgui.begin_table("statistics", 2):
         imgui.table_setup_column("", imgui.TableColumnFlags_.width_fixed, 6.5 * imgui.get_font_size())
         for name, value in rows:
@@ -196,6 +204,11 @@ def _statistics(viewer: Viewer, renderer: str) -> None:
         imgui.end_table()
     if renderer:
         imgui.text_disabled(f"window: {renderer.partition(' (')[0]}")
+
+
+def _left_out(culled: Culled) -> str:
+    parts = ((culled.frustum, "outside"), (culled.backface, "away"), (culled.occluded, "hidden"))
+    return ", ".join(f"{count:,} {why}" for count, why in parts if count) or "nothing"
 
 
 def _help(settings: Settings, inset: float) -> None:

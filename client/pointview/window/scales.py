@@ -4,8 +4,15 @@ from __future__ import annotations
 
 import math
 import re
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 STEPS = (1.0, 2.0, 5.0, 10.0)
+
+MOST_DECIMALS = 10
+"""Fewer are written; smaller numbers have an exponent."""
 
 UNITS = {"metre": "m", "meter": "m", "foot": "ft", "us survey foot": "ft", "foot_us": "ft", "kilometre": "km"}
 """Names of length units in WKT, and what stands behind a number."""
@@ -42,6 +49,13 @@ def written_length(length: float, unit: str) -> str:
             if length * factor >= 1 - 1e-9:
                 return f"{length * factor:g} {name}"
     return f"{length:g} {unit}".rstrip()
+
+
+def written_place(place: Sequence[float], bounds: Sequence[float]) -> str:
+    """How a point is written: to a ten-thousandth of the model's extent, wherever the model lies."""
+    extent = math.dist(bounds[:3], bounds[3:])
+    decimals = max(0, -math.floor(math.log10(1e-4 * extent))) if extent > 0 else MOST_DECIMALS
+    return ", ".join(f"{value:.7g}" if decimals >= MOST_DECIMALS else f"{value:.{decimals}f}" for value in place)
 
 
 def unit_of(crs: str | None) -> str:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pointview.window.scales import ticks, tidy_length, tidy_step, unit_of, written_length
+from pointview.window.scales import ticks, tidy_length, tidy_step, unit_of, written_length, written_place
 
 spans = st.floats(1e-6, 1e7)
 
@@ -66,3 +66,17 @@ def test_the_unit_of_a_reference_system(code, unit, version):
 def test_without_a_reference_system_there_is_no_unit():
     assert unit_of(None) == ""
     assert unit_of("nonsense") == ""
+
+
+@pytest.mark.parametrize(
+    ("place", "size", "text"),
+    [
+        ((515384.8012, 4918361.2178, 2330.7361), 60.0, "515384.801, 4918361.218, 2330.736"),
+        ((-0.0123456, 0.1, 0.2), 0.3, "-0.01235, 0.10000, 0.20000"),
+        ((1.25e6, 0.0, -3.4), 5e6, "1250000, 0, -3"),
+        ((1.5, 2.5, 3.5), 0.0, "1.5, 2.5, 3.5"),
+        ((1.23456789e-12, 0.0, 0.0), 1e-11, "1.234568e-12, 0, 0"),
+    ],
+)
+def test_places_are_written_as_exactly_as_the_model_is_large(place, size, text):
+    assert written_place(place, (0.0, 0.0, 0.0, size, 0.0, 0.0)) == text

@@ -13,11 +13,12 @@ from support import models
 from support.display import until
 
 from lpc.points import PointBatch
+from pointbuild.readers.detect import SUFFIXES
 from pointview.camera import Camera
 from pointview.occlusion import KEPT, Occlusion
 from pointview.refine import refine
 from pointview.render import open_backend
-from pointview.window.commands import tidied
+from pointview.window.commands import SCANS, tidied
 from pointview.window.culling import STRIDE
 from pointview.window.inputs import Inputs
 from pointview.window.mirror import Came, Failed, Opened
@@ -287,3 +288,7 @@ def test_the_window_lives_while_the_renderer_gets_ready(session, monkeypatch):
 )
 def test_what_was_dropped_or_pasted(given, target):
     assert tidied(given) == target
+
+
+def test_all_that_build_reads_is_known_to_be_a_scan():
+    assert set(SCANS) == SUFFIXES

@@ -12,6 +12,8 @@ layout(location = 2) out int out_node;
 const float REACH = @HOLE@;
 const int LARGEST = @LARGEST_HOLE@;
 const int WALLS = @WALLS@;
+const int FACES = @FACES@;
+const float FACE = @FACE@;
 
 void main() {
     // Rows count from the bottom here.
@@ -23,7 +25,9 @@ void main() {
     ivec2 best = here;
     int nearest = LARGEST + 1;
     int found = 0;
-    for (int direction = 0; direction < 8 && found + 8 - direction >= WALLS; ++direction) {
+    int level = 0;
+    for (int direction = 0;
+         direction < 8 && found + 8 - direction >= WALLS && level + 8 - direction >= FACES; ++direction) {
         for (int step = 1; step <= LARGEST; step += step < 4 ? 1 : step / 2) {
             ivec2 there = here + step * directions[direction];
             if (any(lessThan(there, ivec2(0))) || any(greaterThan(there, last)))
@@ -32,15 +36,27 @@ void main() {
             float wide = abs(wall.g);
             if (wall.r < z && float(step) <= max(REACH * wide, 1.0) && wall.r * (1.0 + wide / focal) < z) {
                 ++found;
-                if (step < nearest) {
-                    nearest = step;
-                    best = there;
+                int ahead = max(int(FACE * wide + 0.5), 1);
+                ivec2 beyond = there + ahead * directions[direction];
+                float slope = 0.0;
+                if (all(greaterThanEqual(beyond, ivec2(0))) && all(lessThanEqual(beyond, last))) {
+                    float depth = texelFetch(depths, beyond, 0).r;
+                    slope = depth < @EMPTY@ ? (depth / wall.r - 1.0) * focal / float(ahead) : 0.0;
+                }
+                vec2 along = vec2(directions[direction]);
+                float away = float(step * step) * (dot(along, along) + slope * slope);
+                if (step == 1 || away <= REACH * wide * REACH * wide) {
+                    ++level;
+                    if (step < nearest) {
+                        nearest = step;
+                        best = there;
+                    }
                 }
                 break;
             }
         }
     }
-    if (found < WALLS)
+    if (found < WALLS || level < FACES)
         best = here;
     out_color = texelFetch(picture, best, 0);
     out_depth = texelFetch(depths, best, 0).rg;

@@ -5,9 +5,10 @@
 // BLENDED: its shape is that of a kernel (see blend_kernels.gather).
 
 // vertex: x, y, z in steps; two octahedral bytes
-// color: 0 to 1
+// color: 0 to 1; the last of them says how far apart samples are in a thin part of the cloud (thin.py)
 // cloud_origin: offset of the cloud's (0, 0, 0) from the eye, axes of model space; model units of a step
-// cloud_corner: offset of the same from the corner of the node's cell; side of a splat, pixels times depth
+// cloud_corner: offset of the same from the corner of the node's cell; side of a splat, pixels times depth,
+//     or where the level says to look it up, model units of a step times what places.py says of the node's own samples
 // cloud_numbers: node; its row among the places, + STARVED; its level, or -1: one spacing everywhere; samples
 #ifdef COMMANDS
 in vec4 vertex;
@@ -36,8 +37,9 @@ uniform float round_factor;
 uniform float steepest;
 uniform float reach;
 uniform float closing;     // side of a splat over the spacing to close, times the focal length
-uniform sampler2D places;  // of each level (axis, half); then of each node (links, spacings): see places.py
+uniform sampler2D places;  // of each level (axis, half); then of each node (links, spacings); spreads: see places.py
 uniform int levels;
+uniform int spreads;       // where these begin, texels
 uniform bool oriented;
 uniform vec3 albedo;
 uniform vec3 lamp;         // camera space
@@ -73,7 +75,7 @@ vec4 texel(int i) {
     return texelFetch(places, ivec2(i & 1023, i >> 10), 0);
 }
 
-// The same rule as kernels._facing.
+// The same rule as rules.facing.
 float facing(int row, int level, vec3 p) {
     float spacing = 0.0;
     while (row >= 0) {
@@ -89,10 +91,11 @@ float facing(int row, int level, vec3 p) {
     return abs(spacing);
 }
 
-// The same rule as kernels._spacing_at: the spacing to close at p, negative where starved.
-float spacing_at(int row, int level, vec3 p) {
+// The same rule as rules.spacing_at: the spacing to close at p, negative where starved.
+float spacing_at(int row, int level, float full, vec3 p) {
     float coarsest = 0.0;
     float spacing = 0.0;
+    int last = row;
     while (row >= 0) {
         vec2 halving = texel(level).xy;
         vec3 axis = vec3(equal(vec3(halving.x), vec3(0.0, 1.0, 2.0)));
@@ -101,6 +104,7 @@ float spacing_at(int row, int level, vec3 p) {
         int beyond = int(above ? node.x : node.y);
         float other = abs(above ? node.z : node.w);
         float apart = abs(dot(p, axis) - halving.y);
+        last = row;
         row = int(above ? node.y : node.x);
         spacing = above ? node.w : node.z;
         ++level;
@@ -113,6 +117,7 @@ float spacing_at(int row, int level, vec3 p) {
         }
         p -= above ? axis * halving.y : vec3(0.0);
     }
+    coarsest = full > 0.0 ? max(coarsest, full * texel(spreads + last / 4)[last % 4]) : coarsest;
     return spacing < 0.0 ? -max(-spacing, coarsest) : max(spacing, coarsest);
 }
 
@@ -221,8 +226,10 @@ void main() {
     float across = cloud_corner.w;
     bool starved = cloud_numbers.y >= STARVED;
     if (cloud_numbers.z >= 0) {
+        float thin = floor(255.0 * color.a + 0.5);
+        float full = thin > 0.0 ? cloud_corner.w * exp2(thin / @STEPS@) : 0.0;
         vec3 inside = cloud_corner.xyz + cloud_origin.w * vertex.xyz;
-        float spacing = spacing_at(cloud_numbers.y & (STARVED - 1), cloud_numbers.z, inside);
+        float spacing = spacing_at(cloud_numbers.y & (STARVED - 1), cloud_numbers.z, full, inside);
         across = abs(spacing) * closing;
         starved = spacing < 0.0;
     }
