@@ -160,17 +160,21 @@ def _company(position: NDArray[np.uint16], near: Near, channels: Channels, nbits
 
 def _beside(near: Ints, place: Ints, nbits: int) -> NDArray[np.intp]:
     """Numbers of the context samples before and after each sample in two orders, (8, k); n: there is none."""
-    n = near.shape[1]
-    both = np.concatenate([near, place], axis=1)
+    k, n = place.shape[1], near.shape[1]
+    both = np.concatenate([place, near], axis=1)  # samples stand before a context of the same code
+    number = np.arange(k + n)
     found = []
     for order in range(2):
         cell = (both + order * ((1 << nbits) // 3)) >> max(0, nbits - KEPT)
         code = _SPREAD.take(cell[0]) | (_SPREAD.take(cell[1]) << 1) | (_SPREAD.take(cell[2]) << 2)
-        key = (code[:n].astype(np.int64) << 32) | np.arange(n)
+        key = (code.astype(np.int64) << 32) | number
         key.sort()
+        key &= 0xFFFFFFFF
         line = np.full(n + 4, n, np.intp)
-        line[2:-2] = key & 0xFFFFFFFF
-        after = key.searchsorted(code[n:].astype(np.int64) << 32)
+        line[2:-2] = key[key >= k] - k
+        at = np.flatnonzero(key < k)
+        after = np.empty(k, np.intp)
+        after[key[at]] = at - number[:k]
         found += [line.take(after + beside) for beside in range(4)]
     return np.stack(found)
 

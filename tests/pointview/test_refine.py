@@ -281,20 +281,6 @@ def test_priorities(ring):
     assert by_index.wants.tolist() != by_error.wants.tolist()
     assert by_error.wants.tolist() == refine(ring.index, camera, 0.5, resident, priority="error").wants.tolist()
 
-    def score(node):
-        parent = ring.index.parent[node]
-        shown, after = (pixels(ring.index, camera, number) for number in (parent, node))
-        area = (ring.index.radius[node] * camera.focal / math.dist(ring.index.center[node], camera.eye)) ** 2
-        return (min(shown, 300) - min(max(after, 0.25), 300)) * min(area, 300.0**2) / ring.index.size[node]
-
-    scores = [score(node) for node in by_error.wants.tolist()]
-    np.testing.assert_allclose(scores, sorted(scores, reverse=True), rtol=1e-6)
-
-
-def pixels(index, camera, node):
-    gap = math.dist(index.center[node], camera.eye) - index.radius[node]
-    return index.spacing[node] * camera.focal / gap if gap > 0 else math.inf
-
 
 def test_a_cut_says_what_it_is():
     assert {"nodes", "spacing", "splat_px", "starved", "wants", "pages", "culled"} <= set(Cut.__dataclass_fields__)

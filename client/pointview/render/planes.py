@@ -6,9 +6,10 @@ own cloud (Hoppe et al. 1992, section 3.2), found once, when the cloud is packed
 it: its sign is unknown, so it lights nothing and hides nothing. Where the samples around make no plane, as in foliage,
 there is none.
 
-To be cheap beside the decoding of a cloud, the samples around are those of a block: two cells of a grid along each
-axis, which meet at the corner next to the sample. Sums over cells give the covariance of each block. Samples in blocks
-of too few samples are looked at again with larger cells.
+To be cheap beside the decoding of a cloud, the samples around are those of a block: of the three cells of a grid around
+the sample along each axis, whole the middle one and of the outer ones the shares that put the block's middle at the
+sample. Where a surface bends, the plane of a block beside the sample would lean. Sums over cells give the covariance of
+each block. Samples in blocks of too few samples are looked at again with larger cells.
 """
 
 from __future__ import annotations
@@ -22,16 +23,16 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-FEWEST = 6
+FEWEST = 5
 """Samples of a block that make a plane; three always lie on one."""
 FLAT = 0.6
 """Most deviation of a block's samples from their plane, over their lesser deviation along it. Where a surface bends
 within a block a disc in a rough plane still covers less that it should not than one that faces the eye."""
-CELL = 1.6
+CELL = 1.2
 """Side of a cell, spacings of the cloud's own samples."""
-COARSER = 2.5
+COARSER = 1.5
 """Side of the cells of the next grid over that of the last."""
-GRIDS = 3
+GRIDS = 6
 LARGEST_GRID = 64
 """Cells along an axis."""
 MARGIN = 0.25
@@ -115,30 +116,35 @@ def _fit(
         row[7] += y * y
         row[8] += y * z
         row[9] += z * z
-    found = np.full(len(slot), -2, np.int32)  # of the block around each corner; -1: too few samples
-    total = np.empty(10)
+    total, weight = np.empty(10), np.empty((3, 3))
     done = np.ones(len(pending), np.bool_)
     for p in range(len(pending)):
         i = pending[p]
-        a = math.floor((position[i, 0] - low[0]) * inverse + 0.5)
-        b = math.floor((position[i, 1] - low[1]) * inverse + 0.5)
-        c = math.floor((position[i, 2] - low[2]) * inverse + 0.5)
+        x, y, z = (
+            (position[i, 0] - low[0]) * inverse,
+            (position[i, 1] - low[1]) * inverse,
+            (position[i, 2] - low[2]) * inverse,
+        )
+        a, b, c = math.floor(x), math.floor(y), math.floor(z)
         if a < 0 or a >= nx or b < 0 or b >= ny or c < 0 or c >= nz:
             continue
-        corner = (a * ny + b) * nz + c
-        if found[corner] == -2:
-            total[:] = 0.0
-            for u in range(max(a - 1, 0), min(a, nx - 1) + 1):
-                for v in range(max(b - 1, 0), min(b, ny - 1) + 1):
-                    for w in range(max(c - 1, 0), min(c, nz - 1) + 1):
-                        cell = slot[(u * ny + v) * nz + w]
-                        if cell >= 0:
-                            total += sums[cell]
-            found[corner] = _code(total, flat) if total[0] >= fewest else -1
-        if found[corner] < 0:
-            done[p] = False
+        weight[0, 0], weight[0, 1], weight[0, 2] = 1.0 - (x - a), 1.0, x - a
+        weight[1, 0], weight[1, 1], weight[1, 2] = 1.0 - (y - b), 1.0, y - b
+        weight[2, 0], weight[2, 1], weight[2, 2] = 1.0 - (z - c), 1.0, z - c
+        total[:] = 0.0
+        for u in range(max(a - 1, 0), min(a + 2, nx)):
+            for v in range(max(b - 1, 0), min(b + 2, ny)):
+                part = weight[0, u - a + 1] * weight[1, v - b + 1]
+                for w in range(max(c - 1, 0), min(c + 2, nz)):
+                    cell = slot[(u * ny + v) * nz + w]
+                    if cell >= 0:
+                        share = part * weight[2, w - c + 1]
+                        for k in range(10):
+                            total[k] += share * sums[cell, k]
+        if total[0] >= fewest:
+            codes[i] = _code(total, flat)
         else:
-            codes[i] = found[corner]
+            done[p] = False
     return done
 
 
