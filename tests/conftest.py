@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 # Fixed seeds, and no clock in the verdict: a busy machine must not turn a test red.
-settings.register_profile("pointstream", derandomize=True, deadline=None)
+settings.register_profile("pointstream", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("pointstream")
 
 # A shell that runs tests in the background has them, and all that they start, ignore interrupts: some tests send them.

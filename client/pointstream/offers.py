@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -62,6 +63,7 @@ class Offer:
         place = np.argsort(starts, kind="stable")
         self._key, self._start, self._stop = keys[place], starts[place], stops[place]
         self._by_rank = np.argsort(place, kind="stable")
+        self._turn = np.concatenate([[0], np.cumsum(stops - starts)])[:-1][place]  # bytes more urgent
         self._free = np.ones(len(place), dtype=bool)
         self._alone = alone
         self._cursor = 0
@@ -94,7 +96,7 @@ class Offer:
             self._cursor += 1
         return -1
 
-    def grow(self, seed: int, gap: int, longest: int) -> tuple[int, int]:
+    def grow(self, seed: int, gap: int, longest: int, reach: float = math.inf) -> tuple[int, int]:
         """First and last place of the request around a seed: forward first, then backward.
 
         Parameters
@@ -103,19 +105,22 @@ class Offer:
             Bytes between two neighbours, at most.
         longest : int
             Bytes of the request, at most, unless the seed is longer.
+        reach : float
+            Bytes that are less urgent than the seed and more so than what comes along, at most.
         """
+        turn = float(self._turn[seed]) + reach
         first = last = seed
         start, stop = int(self._start[seed]), int(self._stop[seed])
         if self._alone and int(self._key[seed]) in self._alone:
             return first, last
         while last + 1 < len(self._free) and self._free[last + 1]:
             near, far = int(self._start[last + 1]), int(self._stop[last + 1])
-            if near - stop > gap or far - start > longest:
+            if near - stop > gap or far - start > longest or self._turn[last + 1] > turn:
                 break
             last, stop = last + 1, far
         while first > 0 and self._free[first - 1]:
             near, far = int(self._stop[first - 1]), int(self._start[first - 1])
-            if start - near > gap or stop - far > longest:
+            if start - near > gap or stop - far > longest or self._turn[first - 1] > turn:
                 break
             first, start = first - 1, far
         return first, last

@@ -8,10 +8,12 @@ those allowed by the estimated network bandwidth, and forgetting the rest". A li
 1. *Wants are forgotten.* `offer` replaces all wants that are not in flight. Nothing queues here across a turn of the
    camera.
 2. *Neighbours travel together.* A request grows from the most urgent want (the seed) along the file, forward first,
-   then backward, over wants of any priority, while the gap between them is cheaper than a request. A request costs
-   its headers and, only when less than a round trip of bytes is outstanding, the time in which the link would run
-   dry: ``gap <= overhead + max(0, rate * rtt - outstanding)``. Where the most urgent want waits for others, since it is
-   decoded after its ancestors, it and they travel alone: with neighbours, each would cost it a whole request.
+   then backward, over wants whose turn would come within `reach_seconds` of the link anyway (neighbours of any
+   urgency would turn an order by error into one by place), while the gap between them is cheaper than a request. A
+   request costs its headers and, only when less than a round trip of bytes is outstanding, the time in which the link
+   would run dry: ``gap <= overhead + max(0, rate * rtt - outstanding)``. Where the most urgent want waits for others,
+   since it is decoded after its ancestors, it and they travel alone: with neighbours, each would cost it a whole
+   request.
 3. *A request is short.* At most ``rate * request_seconds`` bytes, but at least one object, so that urgent ones get
    through between two requests and a lost one costs little. Not shorter either: on 1.25 Mbit/s, 0.1 s at a time, the
    heads of a usual server's replies (370 bytes) take 3% of the line.
@@ -38,6 +40,7 @@ Everything is an argument: wants, time, and the state of the link. `offer` and `
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -57,6 +60,8 @@ class SchedulerOptions:
     ----------
     request_seconds : float
         Length of a request, seconds of the link.
+    reach_seconds : float
+        How much less urgent than the seed what comes along may be, seconds of the link.
     smallest_request, largest_request : int
         Bounds of that length in bytes.
     overhead : int
@@ -82,6 +87,7 @@ class SchedulerOptions:
     """
 
     request_seconds: float = 0.1
+    reach_seconds: float = 0.25
     smallest_request: int = 8192
     largest_request: int = 1 << 19
     overhead: int = 400
@@ -217,7 +223,7 @@ class Scheduler:
             seed = self._wants.next_seed()
             if seed < 0:
                 break
-            first, last = self._wants.grow(seed, self._widest_gap(link, outstanding), longest)
+            first, last = self._wants.grow(seed, self._widest_gap(link, outstanding), longest, self._reach(link))
             request = self._wants.request(first, last)
             if outstanding > 0 and outstanding + request.range.size > window:
                 break
@@ -300,6 +306,9 @@ class Scheduler:
         if link is None:
             return self.options.local_gap
         return self.options.overhead + max(0, int(link.rate * link.rtt) - outstanding)
+
+    def _reach(self, link: LinkState | None) -> float:
+        return math.inf if link is None else link.rate * self.options.reach_seconds
 
     def _fill_bucket(self, now: float, link: LinkState | None) -> None:
         passed = 0.0 if self._filled is None else max(0.0, now - self._filled)

@@ -65,18 +65,19 @@ class Motion:
     options: MotionOptions = field(default_factory=MotionOptions)
     _seen: deque[tuple[float, Camera]] = field(default_factory=deque)
 
-    def note(self, t: float, camera: Camera) -> None:
-        """Take in where the camera is at a time in seconds, later than the one before."""
+    def note(self, t: float, camera: Camera) -> bool:
+        """Take in where the camera is at a time in seconds, later than the one before; False if it jumped there."""
         if self._seen:
             before, last = self._seen[-1]
             if t <= before:
-                return
+                return True
             if t - before > self.options.gap or self._jumped(last, camera):
                 self._seen.clear()
         self._seen.append((t, camera))
         # The pose at the beginning of the memory stays: velocity is over the whole of it.
         while len(self._seen) > 2 and self._seen[1][0] <= t - self.options.memory:
             self._seen.popleft()
+        return len(self._seen) > 1
 
     def ahead(self, seconds: float) -> Camera | None:
         """Return the camera after some seconds more of the same motion; None where it rests or is not known yet."""

@@ -10,8 +10,8 @@ array of node numbers and every test below is one numpy expression over it.
    sphere nearest to the eye; infinite where the eye is inside. Below the tolerance the node is fine enough.
 3. Otherwise its children refine it: one whose record is unknown makes its page wanted; one that is not resident is
    wanted itself; one that is resident is visited. A node with a visible child that cannot be drawn yet is *starved*.
-4. Splats show the spacing of the deepest drawn node at their place (`places`): no holes where data is missing, and no
-   fat beside it. LPC's plain rule, one size a cloud, is there for comparison.
+4. Splats show the spacing of the deepest drawn node at their place (`places`), or less where that does (`snug`): no
+   holes where data is missing, and no fat beside it. LPC's plain rule, one size a cloud, is there for comparison.
 
 Nothing here does I/O or reads a clock; equal arguments give equal cuts.
 """
@@ -26,8 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .places import Places, places
+from .snug import snug
 from .splats import CLOSING, LARGEST
 from .uneven import look_below
+from .urgency import removed_per_byte
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -221,6 +223,7 @@ def refine(
     cull_backfaces: bool = True,
     splat_rule: SplatRule = "place",
     hidden: NDArray[np.bool_] | None = None,
+    contrast: NDArray[np.float64] | None = None,
 ) -> Cut:
     """Compute the cut of one frame.
 
@@ -240,6 +243,8 @@ def refine(
         node where that is starved or fine enough, the tolerance where it is refined.
     hidden : (n_nodes,) bool, optional
         Nodes that `occlusion` found to be behind others: neither drawn nor refined nor wanted.
+    contrast : (n_nodes,) float64, optional
+        What the last picture shows in the nodes' cells (`urgency.Contrast`), from which that error is estimated.
 
     Notes
     -----
@@ -269,6 +274,7 @@ def refine(
         spacing = np.where(ends, own, np.minimum(coarseness * (tolerance / spacing_px), own))
         laid_out = None
     else:
+        own = own * snug(index, nodes, spacing_px)
         below = look_below(index, camera, nodes, drawn, missing)
         spacing = _shown_spacing(starts, drawn, np.where(ends, own, 0.0), below.spacing[: len(nodes)])
         alone = np.sqrt(index.density.own[nodes])
@@ -277,7 +283,7 @@ def refine(
     splat_px = np.ones(len(nodes))
     grown = spacing > 0
     splat_px[grown] = CLOSING * spacing_px[grown] * (spacing[grown] / coarseness[grown])
-    wants, pages = _missing(index, camera, tolerance, levels, priority)
+    wants, pages = _missing(index, camera, tolerance, levels, priority, contrast)
     ahead = _ahead(replace(sieve), tolerance, levels, resident) if 0 < len(wants) <= FEW else wants[:0]
     return Cut(
         nodes=nodes,
@@ -323,16 +329,19 @@ def _either(halves: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _missing(
-    index: IndexTree, camera: Camera, tolerance: float, levels: list[_Level], priority: Priority
+    index: IndexTree,
+    camera: Camera,
+    tolerance: float,
+    levels: list[_Level],
+    priority: Priority,
+    contrast: NDArray[np.float64] | None,
 ) -> tuple[Nodes, Nodes]:
     """Wanted nodes and wanted pages, most urgent first."""
     nodes = np.concatenate([level.children[level.missing] for level in levels])
     if len(nodes) == 0:
         return nodes, nodes
     if priority == "error":
-        shown_px = np.concatenate([np.repeat(level.spacing_px, 2).reshape(-1, 2)[level.missing] for level in levels])
-        child_px = np.concatenate([level.child_spacing_px[level.missing] for level in levels])
-        nodes = nodes[np.lexsort((nodes, -_error_per_byte(index, camera, tolerance, nodes, shown_px, child_px)))]
+        nodes = nodes[np.lexsort((nodes, -removed_per_byte(index, camera, tolerance, nodes, contrast)))]
     pages = nodes[~index.known[nodes]] // index.header.page_nodes
     _, first = np.unique(pages, return_index=True)
     return nodes, pages[np.sort(first)]
@@ -358,28 +367,6 @@ def _ahead(sieve: _Sieve, tolerance: float, levels: list[_Level], resident: NDAr
         nodes, spacing_px = children[known][visible], child_spacing_px[visible]
         found.append(np.sort(np.concatenate([nodes[~resident[nodes]], unknown])))
     return np.concatenate(found)
-
-
-def _error_per_byte(
-    index: IndexTree,
-    camera: Camera,
-    tolerance: float,
-    nodes: Nodes,
-    shown_px: NDArray[np.float64],
-    child_px: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Screen error that fetching a node removes, per byte: projected spacing over tolerance, times visible area.
-
-    The area is the square of the sphere's apparent radius. Half the tolerance is as good as nothing. Unknown nodes come
-    first (infinite): their page costs little and hides what else is wanted.
-    """
-    largest = float(max(camera.width, camera.height))
-    distance = np.maximum(np.linalg.norm(index.center[nodes] - np.array(camera.eye), axis=1), 1e-300)
-    fine = np.clip(child_px, 0.5 * tolerance, largest)
-    removed = np.maximum(np.minimum(shown_px, largest) - fine, 0.0) / tolerance
-    area = np.minimum(index.radius[nodes] * camera.focal / distance, largest) ** 2
-    score = removed * area / np.maximum(index.size[nodes], 1)
-    return np.where(index.known[nodes], score, np.inf)
 
 
 def _culled(sieve: _Sieve) -> Culled:

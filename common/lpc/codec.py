@@ -17,7 +17,7 @@ import zstandard
 
 from .channels import Channels, channels_of, from_channels, to_channels
 from .cloud import Cloud
-from .context import Near, Part, Place, line_of, select
+from .context import Near, Part, Place, line_of, select, takes_context
 from .errors import Corrupt
 from .lattice import dequantise
 from .octahedral import decode_normals
@@ -62,7 +62,9 @@ MAX_FRAME_WINDOW = 1 << 27
 class _Codec(Protocol):
     """What `codec_numpy` and `codec_compiled` both are."""
 
-    def arrange(self, lattice: NDArray[np.int64], rows: NDArray[np.uint32], begin: int, end: int) -> Placed: ...
+    def arrange(
+        self, lattice: NDArray[np.int64], rows: NDArray[np.uint32], begin: int, end: int, *, flipping: bool = True
+    ) -> Placed: ...
 
     def pack(
         self,
@@ -151,8 +153,8 @@ def encode_cloud(
     context : sequence of Cloud
         The node's ancestors as they are decoded, from the root down; the last `ANCESTORS` of them count.
     effort : {"default", "best", "fast"}
-        "best" lets zstd search longer; "fast" looks at fewer previous samples and lets zstd search less
-            (docs/format.md, Choices of a writer).
+        "best" lets zstd search longer; "fast" takes no context, looks at fewer previous samples, tries fewer
+            orders and lets zstd search less (docs/format.md, Choices of a writer).
 
     Returns
     -------
@@ -232,12 +234,14 @@ class CloudWriter:
         self._lattice, self._rows = lattice, to_channels(codes, schema, len(lattice))
         self._channels, self._codec = channels_of(schema), _codec(engine)
         self._window, self._compressor = WINDOWS[effort], _contexts.compressor(effort)
+        self._guessing, self._flipping = takes_context(schema, effort), effort != "fast"
         # Faster strategies reuse another stream's Huffman codes in blocks up to 1 KiB, which takes up to 20 % more.
         self._small = _contexts.compressor("default" if effort == "fast" else effort)
 
     def place(self, number: int) -> Placed:
         """Put the samples of a cloud in order."""
-        placed = self._codec.arrange(self._lattice, self._rows, self._bounds[number], self._bounds[number + 1])
+        begin, end = self._bounds[number : number + 2]
+        placed = self._codec.arrange(self._lattice, self._rows, begin, end, flipping=self._flipping)
         if placed.nbits > TOP_BITS or placed.shift > MAX_SHIFT:
             raise ValueError(f"a cloud spans 2**{placed.nbits + placed.shift} steps, 2**48 are the most")
         return placed
@@ -253,7 +257,7 @@ class CloudWriter:
     def frame(self, placed: Placed, context: Sequence[Cloud]) -> bytes:
         """Encode a cloud; `context` as of `encode_cloud`."""
         near = None
-        if context and len(self._channels.guessed):
+        if context and self._guessing:
             x, y, z = placed.corner.tolist()
             near = select(
                 context,

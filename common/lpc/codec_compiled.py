@@ -30,16 +30,21 @@ PAD = 64
 FAR = np.float32(-200_000)
 """Further than any L1 distance of 16-bit coordinates (196,605)."""
 DIGIT = 11
-"""Bits sorted per pass: a few passes for a cloud's code, and counts that stay in the first cache."""
+"""Bits sorted per pass at most: a few passes for a cloud's code, and counts that stay in the first cache."""
+
+STRETCH = 512
+"""Samples that look back together: what they need stays in the first cache."""
 
 # "Nearest" computes with float32 because the compiler widens int32 sums to int64 and then finds no fast
 # minimum. All values are integers below 2**24, so nothing is rounded; "no NaN" lets it vectorise.
 _EXACT_FLOATS = {"nnan", "nsz"}
 
 
-def arrange(lattice: NDArray[np.int64], rows: NDArray[np.uint32], begin: int, end: int) -> Placed:
-    """Put the samples begin to end in the order of the file."""
-    rotation, flips, nbits, shift, corner, code, order = _arrange(lattice, rows, begin, end)
+def arrange(
+    lattice: NDArray[np.int64], rows: NDArray[np.uint32], begin: int, end: int, *, flipping: bool = True
+) -> Placed:
+    """Put the samples begin to end in the order of the file; `flipping`: flips of axes are tried."""
+    rotation, flips, nbits, shift, corner, code, order = _arrange(lattice, rows, begin, end, flipping)
     position = np.empty((end - begin, 3), np.uint16)
     _gather_position(lattice, corner, shift, order, position)
     return Placed(rotation, flips, nbits, shift, corner, order, code, position)
@@ -55,7 +60,7 @@ def pack(
 ) -> Packed:
     """Pack a cloud; normals and colours are guessed from what is near if that is given."""
     k = len(placed.order)
-    sorted_rows = rows[:, placed.order]
+    sorted_rows = rows.take(placed.order, axis=1)
     guessed = np.zeros(len(channels), np.bool_)
     turn = 0
     if near:
@@ -125,29 +130,66 @@ def _gather(value: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _sort(code: Any, order: Any, code_spare: Any, order_spare: Any, bits: int) -> bool:
-    """Radix sort of codes with their sample numbers; True if the result lies in the spare arrays."""
-    k = len(code)
+def _exponents(number: Any, floats: Any) -> Any:
+    """Where the first bit of each number below 2**53 is, in a view of `floats`: 1023 more; 0 for 0."""
+    for i in range(len(number)):
+        floats[i] = np.float64(np.int64(number[i]))
+    exponent = floats.view(np.int64)
+    for i in range(len(number)):
+        exponent[i] >>= 52
+    return exponent
+
+
+@njit(cache=True, nogil=True)
+def _starts(code: Any, place: Any, count: Any, digits: int) -> None:
+    """Where the codes of each digit begin when they are sorted by it."""
+    mask = np.uint64(digits - 1)
+    count[:digits] = 0
+    for i in range(len(code)):
+        count[(code[i] >> place) & mask] += 1
+    total = np.uint32(0)
+    for digit in range(digits):
+        here = count[digit]
+        count[digit] = total
+        total += here
+
+
+@njit(cache=True, nogil=True)
+def _sort_codes(code: Any, spare: Any, bits: int, count: Any) -> bool:
+    """Radix sort of codes; True if the result lies in the spare array."""
     swapped = False
-    count = np.empty(1 << DIGIT, np.int64)
-    mask = np.uint64((1 << DIGIT) - 1)
-    for at in range(0, bits, DIGIT):
+    width = -(-bits // -(-bits // DIGIT)) if bits else 1
+    mask = np.uint64((1 << width) - 1)
+    for at in range(0, bits, width):
         place = np.uint64(at)
-        count[:] = 0
-        for i in range(k):
-            count[(code[i] >> place) & mask] += 1
-        total = 0
-        for digit in range(1 << DIGIT):
-            here = count[digit]
-            count[digit] = total
-            total += here
-        for i in range(k):
-            digit = (code[i] >> place) & mask
+        _starts(code, place, count, 1 << width)
+        for i in range(len(code)):
+            value = code[i]
+            digit = (value >> place) & mask
+            spare[count[digit]] = value
+            count[digit] += np.uint32(1)
+        code, spare = spare, code
+        swapped = not swapped
+    return swapped
+
+
+@njit(cache=True, nogil=True)
+def _sort_order(code: Any, spare: Any, order: Any, order_spare: Any, bits: int, count: Any) -> bool:
+    """Do so with the samples' numbers."""
+    swapped = False
+    width = -(-bits // -(-bits // DIGIT)) if bits else 1
+    mask = np.uint64((1 << width) - 1)
+    for at in range(0, bits, width):
+        place = np.uint64(at)
+        _starts(code, place, count, 1 << width)
+        for i in range(len(code)):
+            value = code[i]
+            digit = (value >> place) & mask
             to = count[digit]
-            count[digit] = to + 1
-            code_spare[to] = code[i]
+            count[digit] = to + np.uint32(1)
+            spare[to] = value
             order_spare[to] = order[i]
-        code, code_spare = code_spare, code
+        code, spare = spare, code
         order, order_spare = order_spare, order
         swapped = not swapped
     return swapped
@@ -183,60 +225,57 @@ def _sort_ties(lattice: Any, rows: Any, order: Any, first: int, stop: int) -> No
 
 
 @njit(cache=True, nogil=True)
-def _put(raw: Any, at: int, pending: Any, filled: int, value: Any, width: int) -> Any:
-    """Append `width` bits; returns byte, pending bits and their number (below 8)."""
-    pending |= value << np.uint64(filled)
+def _put(raw: Any, at: Any, pending: Any, filled: Any, value: Any, width: Any) -> Any:
+    """Append `width` bits, at most 56; returns byte, pending bits and their number (below 8). All are unsigned."""
+    pending |= value << filled
     filled += width
-    while filled >= 8:
-        raw[at] = np.uint8(pending & np.uint64(255))
-        at += 1
-        pending >>= np.uint64(8)
-        filled -= 8
-    return at, pending, filled
+    # All 8 bytes are written, and what is not full is written over: no branch to guess, and one store.
+    for byte in range(8):
+        raw[at + np.uint64(byte)] = np.uint8((pending >> np.uint64(8 * byte)) & np.uint64(255))
+    whole = filled >> np.uint64(3)
+    return at + whole, (pending >> (np.uint64(4) * whole)) >> (np.uint64(4) * whole), filled & np.uint64(7)
 
 
 @njit(cache=True, nogil=True)
-def _finish(raw: Any, at: int, pending: Any, filled: int) -> int:
+def _finish(raw: Any, at: Any, pending: Any, filled: Any) -> Any:
     """Pad a bit stream to a byte."""
     if filled:
         raw[at] = np.uint8(pending)
-        at += 1
+        at += np.uint64(1)
     return at
 
 
 @njit(cache=True, nogil=True)
-def _write(number: Any, tokens: Any, raw: Any, at: int) -> int:
+def _write(number: Any, floats: Any, tokens: Any, raw: Any, at: Any) -> Any:
     """Write a channel of numbers as tokens and one raw stream from byte `at` on; returns its end."""
-    pending = np.uint64(0)
-    filled = 0
+    exponent = _exponents(number, floats)
+    pending, filled = np.uint64(0), np.uint64(0)
     for i in range(len(number)):
-        value = number[i]
-        if value < 2:
-            tokens[i] = np.uint8(value)
-        else:
-            width = _bit_length(value) - 2
-            tokens[i] = np.uint8(((width + 1) << 1) | np.int64((value >> np.uint64(width)) & np.uint64(1)))
-            value &= (np.uint64(1) << np.uint64(width)) - np.uint64(1)
-            at, pending, filled = _put(raw, at, pending, filled, value, width)
+        value, width = number[i], np.uint64(max(exponent[i] - 1024, 0))
+        # 0 and 1 are their own tokens; then the width and the two first bits, which are 2 or 3, make the token.
+        top = value >> width
+        tokens[i] = np.uint8(np.uint64(2) * width + top)
+        at, pending, filled = _put(raw, at, pending, filled, value ^ (top << width), width)
     return _finish(raw, at, pending, filled)
 
 
 @njit(cache=True, nogil=True, fastmath=_EXACT_FLOATS)
-def _nearest(xs: Any, ys: Any, zs: Any, i: int, window: int) -> Any:
-    """How far back in order the nearest of the `window` samples before sample i stands (L1)."""
-    x, y, z = xs[PAD + i], ys[PAD + i], zs[PAD + i]
-    best = np.float32(3e38)
-    first = PAD + i - window
-    for m in range(window):
-        distance = abs(xs[first + m] - x) + abs(ys[first + m] - y) + abs(zs[first + m] - z)
-        packed = distance * np.float32(64) + np.float32(window - 1 - m)
-        best = min(best, packed)
-    return (np.int64(best) & 63) + 1
+def _nearest(xs: Any, ys: Any, zs: Any, begin: int, window: int, best: Any) -> None:
+    """Fill in how near the nearest of the `window` samples before each is (L1), times 64, and how far back less 1."""
+    x, y, z = xs[begin : begin + len(best)], ys[begin : begin + len(best)], zs[begin : begin + len(best)]
+    best[:] = np.float32(3e38)
+    # All samples at once look one place back, then two: one after another they would make no vectors.
+    for back in range(1, window + 1):
+        at = begin - back
+        a, b, c = xs[at : at + len(best)], ys[at : at + len(best)], zs[at : at + len(best)]
+        for i in range(len(best)):
+            distance = abs(a[i] - x[i]) + abs(b[i] - y[i]) + abs(c[i] - z[i])
+            best[i] = min(best[i], distance * np.float32(64) + np.float32(back - 1))
 
 
 @njit(cache=True, nogil=True)
 def _predecessors(position: Any, window: int, before: Any) -> None:
-    """Fill in `_nearest` of all samples; 0: there is none."""
+    """Fill in how far back the nearest of the `window` samples before each stands; 0: there is none."""
     k = len(before)
     xs, ys, zs = np.empty(PAD + k, np.float32), np.empty(PAD + k, np.float32), np.empty(PAD + k, np.float32)
     xs[:PAD] = FAR
@@ -244,15 +283,12 @@ def _predecessors(position: Any, window: int, before: Any) -> None:
     zs[:PAD] = 0
     for i in range(k):
         xs[PAD + i], ys[PAD + i], zs[PAD + i] = position[i, 0], position[i, 1], position[i, 2]
-    if window == 64:  # a constant trip count is faster
-        for i in range(k):
-            before[i] = _nearest(xs, ys, zs, i, 64)
-    elif window == 16:
-        for i in range(k):
-            before[i] = _nearest(xs, ys, zs, i, 16)
-    else:
-        for i in range(k):
-            before[i] = _nearest(xs, ys, zs, i, window) if window else 0
+    best = np.empty(min(k, STRETCH), np.float32)
+    for begin in range(0, k, STRETCH):
+        count = min(STRETCH, k - begin)
+        _nearest(xs, ys, zs, PAD + begin, window, best[:count])
+        for i in range(count):
+            before[begin + i] = (np.int64(best[i]) & 63) + 1 if window else 0
     before[0] = 0
 
 
@@ -269,7 +305,7 @@ def _residuals(value: Any, before: Any, bits: int, start: int, number: Any) -> N
 
 
 @njit(cache=True, nogil=True)
-def _arrange(lattice: Any, rows: Any, begin: int, end: int) -> Any:
+def _arrange(lattice: Any, rows: Any, begin: int, end: int, flipping: bool) -> Any:
     """Sort samples; returns rotation, flips, bits and low bits of coordinates, corner, codes and sample numbers."""
     k = end - begin
     corner = lattice[begin].copy()
@@ -282,6 +318,8 @@ def _arrange(lattice: Any, rows: Any, begin: int, end: int) -> Any:
     shift = max(0, width - 16)
     nbits = width - shift
 
+    # Flips move the corner, by less than 2**16: same limit as `payload.may_flip`.
+    flipping &= shift == 0 and min(corner[0], corner[1], corner[2]) > (1 << 16) - (np.int64(1) << 52)
     span = np.empty(3, np.int64)
     spread = np.empty((2, 3, k), np.uint64)
     for axis in range(3):
@@ -289,42 +327,42 @@ def _arrange(lattice: Any, rows: Any, begin: int, end: int) -> Any:
         for i in range(k):
             local = (lattice[begin + i, axis] - corner[axis]) >> shift
             spread[0, axis, i] = _spread(np.uint64(local))
-            spread[1, axis, i] = _spread(np.uint64(span[axis] - local))
+            if flipping:
+                spread[1, axis, i] = _spread(np.uint64(span[axis] - local))
 
     # The rotation that makes the differences shortest puts the thin axis in the top bit of every three; the best flips
-    # let the curve follow slopes. Same limit as `payload.may_flip`.
-    code = np.empty(k, np.uint64)
-    order = np.empty(k, np.uint32)
-    code_spare = np.empty(k, np.uint64)
-    order_spare = np.empty(k, np.uint32)
-    best_code = np.empty(k, np.uint64)
-    best_order = np.empty(k, np.uint32)
+    # let the curve follow slopes.
+    code, spare = np.empty(k, np.uint64), np.empty(k, np.uint64)
+    order, order_spare = np.empty(k, np.uint32), np.empty(k, np.uint32)
+    count, floats = np.empty(1 << DIGIT, np.uint32), np.empty(k, np.float64)
     rotation = flips = 0
     least = np.int64(0)
-    tries = 10 if shift == 0 and min(corner[0], corner[1], corner[2]) > (1 << 16) - (np.int64(1) << 52) else 3
-    for attempt in range(tries):
+    tries = 10 if flipping else 3
+    for attempt in range(tries + 1):  # the last is for the best once more, now with the numbers of the samples
         turn = attempt if attempt < 3 else rotation
-        flipped = max(attempt - 2, 0)
+        flipped = flips if attempt == tries else max(attempt - 2, 0)
         a, b, c = turn, (turn + 1) % 3, (turn + 2) % 3
         in_a, in_b, in_c = spread[flipped >> a & 1, a], spread[flipped >> b & 1, b], spread[flipped >> c & 1, c]
         for i in range(k):
             code[i] = in_a[i] | (in_b[i] << np.uint64(1)) | (in_c[i] << np.uint64(2))
-            order[i] = begin + i
-        if _sort(code, order, code_spare, order_spare, 3 * nbits):
-            code, code_spare = code_spare, code
-            order, order_spare = order_spare, order
+        if attempt == tries:
+            break
+        if _sort_codes(code, spare, 3 * nbits, count):
+            code, spare = spare, code
+        spare[0] = code[0]
+        for i in range(1, k):
+            spare[i] = code[i] - code[i - 1]
+        exponent = _exponents(spare, floats)
         cost = np.int64(0)
-        last = np.uint64(0)
         for i in range(k):
-            cost += _bit_length(code[i] - last)
-            last = code[i]
+            cost += max(exponent[i] - 1022, 0)
         if attempt == 0 or cost < least:
             least = cost
             rotation, flips = turn, flipped
-            code, best_code = best_code, code
-            order, best_order = best_order, order
-    code = best_code
-    order = best_order
+    for i in range(k):
+        order[i] = begin + i
+    if _sort_order(code, spare, order, order_spare, 3 * nbits, count):
+        code, order = spare, order_spare
 
     first = 0
     for i in range(1, k + 1):
@@ -356,32 +394,31 @@ def _pack(
     raw_bits = 3 * shift + max(code_bits - 2, 0)
     for row in range(len(bits)):
         raw_bits += max(bits[row] - 2, 0)
-    raw = np.empty((k * raw_bits + 7) // 8 + 2 + len(bits), np.uint8)
+    raw = np.empty((k * raw_bits + 7) // 8 + 10 + len(bits), np.uint8)
     tokens = np.empty((1 + len(bits), k), np.uint8)
-    at = 0
+    at = np.uint64(0)
     if shift:
-        pending = np.uint64(0)
-        filled = 0
+        pending, filled = np.uint64(0), np.uint64(0)
         mask = (np.int64(1) << shift) - 1
         for i in range(k):
             for axis in range(3):
                 low = np.uint64((lattice[order[i], axis] - corner[axis]) & mask)
-                at, pending, filled = _put(raw, at, pending, filled, low, shift)
+                at, pending, filled = _put(raw, at, pending, filled, low, np.uint64(shift))
         at = _finish(raw, at, pending, filled)
 
-    number = np.empty(k, np.uint64)
+    number, floats = np.empty(k, np.uint64), np.empty(k, np.float64)
     number[0] = code[0]
     for i in range(1, k):
         number[i] = code[i] - code[i - 1]
-    at = _write(number, tokens[0], raw, at)
+    at = _write(number, floats, tokens[0], raw, at)
     for row in range(len(bits)):
         if ready[row]:
             for i in range(k):
                 number[i] = rows[row, i]
         else:
             _residuals(rows[row], before, bits[row], start[row], number)
-        at = _write(number, tokens[1 + row], raw, at)
-    return raw[:at], tokens
+        at = _write(number, floats, tokens[1 + row], raw, at)
+    return raw[: np.int64(at)], tokens
 
 
 @njit(cache=True, nogil=True)

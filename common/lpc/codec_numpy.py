@@ -29,8 +29,10 @@ _GATHER = ((2, 0x0C30C30C30C3), (4, 0x00F00F00F00F), (8, 0x0000FF0000FF), (16, 0
 """Shift and mask per round: from 16 bits side by side to every third of 48, and back."""
 
 
-def arrange(lattice: NDArray[np.int64], rows: NDArray[np.uint32], begin: int, end: int) -> Placed:
-    """Put the samples begin to end in the order of the file."""
+def arrange(
+    lattice: NDArray[np.int64], rows: NDArray[np.uint32], begin: int, end: int, *, flipping: bool = True
+) -> Placed:
+    """Put the samples begin to end in the order of the file; `flipping`: flips of axes are tried."""
     points = lattice[begin:end]
     corner = points.min(axis=0)
     local = points - corner
@@ -41,7 +43,7 @@ def arrange(lattice: NDArray[np.int64], rows: NDArray[np.uint32], begin: int, en
     span = top.max(axis=0)
     rotation = min(range(3), key=lambda turn: _cost(_morton(top, turn)))
     flips = 0
-    if may_flip(corner.tolist(), shift):
+    if flipping and may_flip(corner.tolist(), shift):
         flips = min(range(8), key=lambda flips: _cost(_morton(_flipped(top, span, flips), rotation)))
     code = _morton(_flipped(top, span, flips), rotation)
     order = np.lexsort((*rows[::-1, begin:end], *local.T[::-1], code))

@@ -28,8 +28,13 @@ ANCESTORS = 4
 
 
 def has_context(schema: Schema) -> bool:
-    """Whether clouds are told from their ancestors: normals and colours are."""
+    """Whether clouds may be told from their ancestors: normals and colours are."""
     return any(attribute.kind != "scalar" for attribute in schema)
+
+
+def takes_context(schema: Schema, effort: str) -> bool:
+    """Whether our writer tells them so: not where it has to be fast."""
+    return effort != "fast" and has_context(schema)
 
 
 def line_of(number: int, parent: Sequence[int] | NDArray[Any]) -> list[int]:

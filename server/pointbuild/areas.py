@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from .cells import Cells
 
 NEIGHBOURS = 8
+BESIDE = 32
+"""In the order of paths on either side: where neighbours are looked for first."""
 FEWEST = 32
 """Samples of a region that is measured by its neighbours."""
 STRAIGHT = 0.25
@@ -224,16 +226,20 @@ def _probe(xyz: Any, priority: Any, lows: Any, highs: Any, faces: Any, queries: 
             for i in range(len(squared)):
                 dx, dy, dz = x[i] - px, y[i] - py, z[i] - pz
                 squared[i] = dx * dx + dy * dy + dz * dz
-            found = 0
-            for i in range(len(squared)):
-                value = squared[i]
-                if value > 0.0 and (found < 8 or value < nearest[found - 1]):
-                    at = min(found, 7)
-                    while at > 0 and nearest[at - 1] > value:
-                        nearest[at] = nearest[at - 1]
-                        at -= 1
-                    nearest[at] = value
-                    found = min(found + 1, 8)
+            found, limit = 0, np.inf
+            # Neighbours in the order of paths come first: they are near, and after them hardly any other is nearer.
+            begin, end = max(chosen[q] - BESIDE, 0), min(chosen[q] + BESIDE, len(squared))
+            for first, last in ((begin, end), (0, begin), (end, len(squared))):
+                for i in range(first, last):
+                    value = squared[i]
+                    if value < limit and value > 0.0:
+                        at = min(found, 7)
+                        while at > 0 and nearest[at - 1] > value:
+                            nearest[at] = nearest[at - 1]
+                            at -= 1
+                        nearest[at] = value
+                        found = min(found + 1, 8)
+                        limit = nearest[7] if found == 8 else np.inf
             radius = np.sqrt(nearest[found - 1]) if found else 0.0
             distance[q] = radius * np.sqrt(np.pi / max(found, 1))
             inside[q] = (

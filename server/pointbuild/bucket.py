@@ -12,8 +12,7 @@ from lpc.octahedral_compiled import unit_vectors
 
 from .areas import Probing, measure
 from .priority import defer_copies
-from .rows import as_words, positions
-from .spool import write_all
+from .rows import as_words, positions, priorities_of
 from .tree import Tree, grow
 
 if TYPE_CHECKING:
@@ -116,10 +115,11 @@ def partition(
     cells: Cells,
     probing: Probing,
     cloud_size: int,
+    seed: int,
     regions: Rows,
     normal_bits: int,
 ) -> BucketTree:
-    """Sort a bucket's rows by node, in place on disk; `Rows.settle` may be called once the result is safe.
+    """Sort a bucket's rows by node and put them back; `Rows.settle` may be called once the result is safe.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def partition(
         Which rows.
     above, shares : list of int
         Upper nodes from the root to the bucket, and how many samples each takes.
-    cells, probing, cloud_size
+    cells, probing, cloud_size, seed
         How to divide and measure.
     regions : Rows
         Where they are.
@@ -139,7 +139,7 @@ def partition(
     rows, scratch = sort_by_path(rows, cells, bucket)
     xyz = positions(rows)
     fixed = cells.fixed(xyz)
-    priority = np.ascontiguousarray(rows["priority"])
+    priority = priorities_of(rows, seed)
     defer_copies(fixed, priority)
     areas = measure(cells, probing, fixed, xyz, priority, bucket.depth)
     del xyz
@@ -156,8 +156,7 @@ def partition(
     out = np.empty_like(rows)
     np.take(as_words(rows), order, axis=0, out=as_words(out), mode="clip")  # "raise" would copy once more
     clouds = summarise(out, ends - counts, counts, normal_bits)
-    with regions.rewriting(first_row) as file:
-        write_all(file, out, 0)
+    regions.replace(first_row, out)
     clouds.first[:] += first_row
     used = np.flatnonzero(counts[: len(above)])
     measured = np.flatnonzero(areas.region & (areas.spacing > 0))
@@ -188,15 +187,14 @@ def sort_by_path(rows: NDArray[Any], cells: Cells, bucket: Bucket) -> tuple[NDAr
     Rows of equal paths come in any order.
     """
     window = cells.window(bucket.depth, 64 - INDEX_BITS)
-    packed = cells.keys(positions(rows), window)
+    xyz = positions(rows)
+    packed = cells.keys(xyz, window)
     _pack(packed)
     packed.sort()
     order = np.empty(len(rows), np.int32)
-    tied = _unpack(packed, order)
-    if tied and window.bits == 64 - INDEX_BITS:
+    if _unpack(packed, xyz, order):
         # 42 bits did not tell some apart: the rest of the path does. Rare, so a general sort will do.
-        rest = cells.fixed(positions(rows))
-        _sort_ties(packed, order, rest, cells.axes, cells.shifts, bucket.depth + window.bits)
+        _sort_ties(packed, order, cells.fixed(xyz), cells.axes, cells.shifts, bucket.depth + window.bits)
     out = np.empty_like(rows)
     np.take(as_words(rows), order, axis=0, out=as_words(out), mode="clip")  # "raise" would copy once more
     return out, packed
@@ -209,12 +207,14 @@ def _pack(keys: Any) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _unpack(packed: Any, order: Any) -> Any:
-    """Fill `order`; whether neighbours share a key."""
+def _unpack(packed: Any, xyz: Any, order: Any) -> Any:
+    """Fill `order`; whether samples of different places share a key."""
     tied = False
     for i in range(len(packed)):
         order[i] = packed[i] & np.uint64(4194303)
-        tied |= i > 0 and packed[i] >> np.uint64(22) == packed[i - 1] >> np.uint64(22)
+        if i > 0 and packed[i] >> np.uint64(22) == packed[i - 1] >> np.uint64(22):
+            a, b = order[i], order[i - 1]
+            tied |= xyz[a, 0] != xyz[b, 0] or xyz[a, 1] != xyz[b, 1] or xyz[a, 2] != xyz[b, 2]
     return tied
 
 

@@ -134,7 +134,7 @@ class Cells:
         _descend(xyz, self.low, self.extent, window.axis, window.shift, window.table, entries, cell)
 
     def count(
-        self, xyz: NDArray[np.float64], window: Window, cell: NDArray[np.int32], counts: NDArray[np.int64]
+        self, xyz: NDArray[np.float64], window: Window, cell: NDArray[np.int32], counts: NDArray[np.integer]
     ) -> None:
         """Add the samples that stand at a table: ``counts[-cell - 1, key] += 1`` where cell < 0."""
         _count(xyz, self.low, self.extent, window.axis, window.shift, window.table, cell, counts)

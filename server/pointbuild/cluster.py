@@ -99,11 +99,10 @@ class ClusterCrew(Crew):
         shared = SharedRegions(self._share, regions.dtype, regions.first)
         self._share.make()
         journal = folder.journal("share")
-        # From the end of the file, so that its room becomes that of the share.
-        for bucket in reversed(range(len(regions.first) - 1 - journal.entries)):
+        for bucket in range(journal.entries, len(regions.first) - 1):
             shared.take(regions, bucket)
             journal.add(np.array(bucket))
-            regions.cut(bucket)
+            regions.settle(bucket)  # its room becomes that of the share
         return shared
 
     def spread(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[tuple[Item, Result]]:

@@ -92,7 +92,6 @@ def divide(
     plan = _count(spool, frame, cells, most, folder, crew, progress)
     check_piles(plan.buckets)
     regions.lay_out(row_dtype(schema, short=frame.short, owned=owned), [bucket.count for bucket in plan.buckets])
-    regions.restore()
     limits = candidate_limits(plan, cloud_size, slack)
     candidates = _scatter(spool, frame, plan, limits, seed, schema, regions, folder, crew, progress)
     gathered = folder.journal("gather")
@@ -101,11 +100,11 @@ def divide(
         slack *= 4
         limits = candidate_limits(plan, cloud_size, slack)
         recalled = next(known, None)
-        candidates = gather(regions, limits, GATHERED) if recalled is None else Candidates(*recalled)
+        candidates = gather(regions, limits, seed, GATHERED) if recalled is None else Candidates(*recalled)
         if recalled is None:
             gathered.add(candidates.priority, candidates.bucket)
     rows = crew.share(regions, folder)
-    trees = _partition(plan, upper, cells, probing, most, cloud_size, schema, rows, folder, crew, progress)
+    trees = _partition(plan, upper, cells, probing, most, cloud_size, seed, schema, rows, folder, crew, progress)
     spacing = model_spacing(
         np.concatenate([tree.spacing for tree in trees]), np.concatenate([tree.weight for tree in trees])
     )
@@ -172,6 +171,7 @@ def _partition(
     probing: Probing,
     most: int,
     cloud_size: int,
+    seed: int,
     schema: Schema,
     rows: Rows,
     folder: Folder,
@@ -187,6 +187,7 @@ def _partition(
         cells=cells,
         probing=probing,
         cloud_size=cloud_size,
+        seed=seed,
         regions=rows,
         normal_bits=next((attribute.bits for attribute in schema if attribute.kind == "normal"), 0),
     )
@@ -198,7 +199,7 @@ def _partition(
     for number, tree in crew.spread(one, range(len(trees), len(plan.buckets))):
         trees.append(tree)
         journal.add(*tree.arrays())
-        rows.settle(int(rows.first[number]))
+        rows.settle(number)
         progress.advance(plan.buckets[number].count)
     return trees
 

@@ -16,13 +16,14 @@ from numba import njit
 
 from lpc.bounds import decode_centers, quantise_cones, quantise_spheres
 from lpc.codec import CloudWriter, Effort
-from lpc.context import ANCESTORS, has_context, line_of, with_ancestors
+from lpc.context import ANCESTORS, line_of, takes_context, with_ancestors
 from lpc.octahedral import decode_normals, encode_normals
 from lpc.octahedral_compiled import unit_vectors
 from lpc.page import RECORD
 
 from .ancestry import Ancestor, Ancestry
 from .extend import OWNER
+from .rows import copy_places
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -109,7 +110,7 @@ def encode_run(
     old: OldClouds | None = None,
 ) -> Run:
     """Encode nodes `first` to `stop - 1`, but for those that are clouds of an older model."""
-    generations = ANCESTORS if has_context(schema) else 0
+    generations = ANCESTORS if takes_context(schema, effort) else 0
     family = with_ancestors(np.arange(first, stop), nodes.parent, generations)
     known = ancestry.find(family[family < first].tolist())
     family = family[[node not in known for node in family.tolist()]]
@@ -198,7 +199,7 @@ def _read(
             rows = np.empty(int(nodes.run_count[run]), regions.dtype)
             regions.read(int(nodes.run_first[run]), rows)
             to = slice(at, at + len(rows))
-            lattice[to] = rows["xyz"]
+            copy_places(rows["xyz"], lattice[to])
             if known:
                 owner[to] = rows[OWNER]
             for name in names:

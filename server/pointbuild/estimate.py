@@ -39,7 +39,7 @@ PART = 4
 
 _WINDOW = 63
 _COARSE = 20  # path bits that tell most samples to be in no cell
-_ROW = np.dtype([("priority", "<u8"), ("xyz", "<f8", (3,))])
+_ROW = np.dtype([("xyz", "<f8", (3,))])
 
 
 @dataclass(slots=True)
@@ -64,10 +64,10 @@ class Sketch:
         if not other.samples:
             return
         self.samples += other.samples
-        self.hashes, first = np.unique(np.concatenate([self.hashes, other.hashes]), return_index=True)
-        self.xyz = np.concatenate([self.xyz, other.xyz])[first]
-        few = max(int(np.searchsorted(self.hashes, _limit(self.samples), side="right")), 1)
-        self.hashes, self.xyz = self.hashes[:few], self.xyz[:few]
+        hashes, xyz = np.concatenate([self.hashes, other.hashes]), np.concatenate([self.xyz, other.xyz])
+        small = np.flatnonzero(hashes <= max(_limit(self.samples), hashes.min()))
+        self.hashes, first = np.unique(hashes[small], return_index=True)
+        self.xyz = xyz[small[first]]
 
     def arrays(self) -> list[NDArray[Any]]:
         """Everything, for a journal."""
@@ -137,11 +137,9 @@ def estimate_spacing(
 
 def _measure(xyz: NDArray[np.float64], cells: Cells, probing: Probing) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Spacings of all regions, and their samples."""
-    rows = np.empty(len(xyz), _ROW)
-    rows["xyz"], rows["priority"] = xyz, _hashes(xyz)
-    rows, _ = sort_by_path(rows, cells, Bucket(0, len(rows)))
+    rows, _ = sort_by_path(np.ascontiguousarray(xyz).view(_ROW)[:, 0], cells, Bucket(0, len(xyz)))
     xyz = np.ascontiguousarray(rows["xyz"])
-    areas = measure(cells, probing, cells.fixed(xyz), xyz, np.ascontiguousarray(rows["priority"]), 0)
+    areas = measure(cells, probing, cells.fixed(xyz), xyz, _hashes(xyz), 0)
     measured = np.flatnonzero(areas.region & (areas.spacing > 0))
     return areas.spacing[measured], (areas.high - areas.low)[measured]
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from .options import BuildOptions
 
-LAYOUT = 3
+LAYOUT = 4
 """Of the folder's files; a change of any of them makes it another."""
 
 _ENDS = 1 << 16  # bytes hashed at both ends of an input

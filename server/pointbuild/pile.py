@@ -21,7 +21,7 @@ from lpc.page import COINCIDENT
 from .areas import Probing, pile_spacing
 from .bucket import BucketTree, Clouds, summarise
 from .priority import COPY
-from .rows import positions
+from .rows import positions, priorities_of
 from .spool import read_all, write_all
 from .tree import TOO_MANY, Tree
 
@@ -57,6 +57,7 @@ def partition_pile(
     cells: Cells,
     probing: Probing,
     cloud_size: int,
+    seed: int,
     regions: Rows,
     normal_bits: int,
 ) -> BucketTree:
@@ -66,7 +67,7 @@ def partition_pile(
     ----------
     most : int
         Rows to hold in memory.
-    first_row, bucket, above, shares, cells, probing, cloud_size, regions, normal_bits
+    first_row, bucket, above, shares, cells, probing, cloud_size, seed, regions, normal_bits
         As for `bucket.partition`.
 
     Raises
@@ -75,7 +76,7 @@ def partition_pile(
         If more samples coincide than a chain of nodes can hold.
     """
     taken = np.array(shares, np.int64)
-    _sort_by_priority(first_row, bucket.count, most, regions)
+    _sort_by_priority(first_row, bucket.count, most, seed, regions)
     ordered = regions.replaced()
     left = bucket.count - int(taken.sum())
     first = cells.fixed(positions(next(regions.chunks(first_row, 1, 1))))
@@ -93,7 +94,7 @@ def partition_pile(
     used = np.flatnonzero(taken)
     (face,) = cells.faces(first, np.array([bucket.depth]))
     asked = next(ordered.chunks(first_row, min(bucket.count, probing.region), probing.region))
-    priority = np.ascontiguousarray(asked["priority"])
+    priority = priorities_of(asked, seed)
     spacing = pile_spacing(positions(asked), priority, face, probing, bucket.count)
     measured = [spacing] if spacing > 0 else []
     area = spacing**2 * bucket.count
@@ -109,12 +110,12 @@ def partition_pile(
     )
 
 
-def _sort_by_priority(first_row: int, count: int, most: int, regions: Rows) -> None:
+def _sort_by_priority(first_row: int, count: int, most: int, seed: int, regions: Rows) -> None:
     """Sort the rows, about `most` at a time, and let copies come last."""
     shift = np.uint64(64 - SLICE_BITS)
     histogram = np.zeros(1 << SLICE_BITS, np.int64)
     for rows in regions.chunks(first_row, count, CHUNK):
-        histogram += np.bincount((rows["priority"] >> shift).astype(np.int64), minlength=len(histogram))
+        histogram += np.bincount((priorities_of(rows, seed) >> shift).astype(np.int64), minlength=len(histogram))
     slice_of = np.maximum(np.cumsum(histogram) - 1, 0) // most
     sizes = np.bincount(slice_of, histogram).astype(np.int64)
     starts = np.cumsum(sizes) - sizes
@@ -123,7 +124,7 @@ def _sort_by_priority(first_row: int, count: int, most: int, regions: Rows) -> N
 
     def parts(wanted: NDArray[np.bool_]) -> Iterator[tuple[int, NDArray[Any]]]:
         for rows in regions.chunks(first_row, count, CHUNK):
-            number = slice_of[(rows["priority"] >> shift).astype(np.int64)]
+            number = slice_of[(priorities_of(rows, seed) >> shift).astype(np.int64)]
             for each in np.unique(number[wanted[number]]).tolist():
                 yield each, rows[number == each]
 
@@ -135,32 +136,35 @@ def _sort_by_priority(first_row: int, count: int, most: int, regions: Rows) -> N
         for start, length in zip((count + starts[~heavy]).tolist(), sizes[~heavy].tolist(), strict=True):
             rows = np.empty(length, regions.dtype)
             read_all(file, rows, start * size)
-            write_all(file, rows[np.argsort(rows["priority"])], start * size)
+            write_all(file, rows[np.argsort(priorities_of(rows, seed))], start * size)
         for each in np.flatnonzero(heavy).tolist():
-            _place_equals(partial(parts, np.arange(len(heavy)) == each), count + int(starts[each]), file, size)
-        _split_copies(count, file, regions.dtype)
+            _place_equals(partial(parts, np.arange(len(heavy)) == each), count + int(starts[each]), seed, file, size)
+        _split_copies(count, seed, file, regions.dtype)
         os.truncate(file, count * size)
 
 
-def _place_equals(parts: Callable[[], Iterator[tuple[int, NDArray[Any]]]], start: int, file: int, size: int) -> None:
+def _place_equals(
+    parts: Callable[[], Iterator[tuple[int, NDArray[Any]]]], start: int, seed: int, file: int, size: int
+) -> None:
     """Write rows in order from row `start` on: many rows, but of few priorities, since most are equal."""
     counts: Counter[int] = Counter()
     for _, part in parts():
-        values, times = np.unique(part["priority"], return_counts=True)
+        values, times = np.unique(priorities_of(part, seed), return_counts=True)
         counts.update(dict(zip(values.tolist(), times.tolist(), strict=True)))
     place = {}
     for value in sorted(counts):
         place[value] = start
         start += counts[value]
     for _, part in parts():
-        ordered = part[np.argsort(part["priority"])]
-        values, first = np.unique(ordered["priority"], return_index=True)
-        for value, run in zip(values.tolist(), np.split(ordered, first[1:]), strict=True):
+        priority = priorities_of(part, seed)
+        order = np.argsort(priority)
+        values, first = np.unique(priority[order], return_index=True)
+        for value, run in zip(values.tolist(), np.split(part[order], first[1:]), strict=True):
             write_all(file, run, place[value] * size)
             place[value] += len(run)
 
 
-def _split_copies(count: int, file: int, dtype: np.dtype[Any]) -> None:
+def _split_copies(count: int, seed: int, file: int, dtype: np.dtype[Any]) -> None:
     """Move `count` sorted rows from row `count` on to the start, first those that are no copies."""
 
     def parts() -> Iterator[tuple[NDArray[Any], NDArray[np.bool_]]]:
@@ -168,7 +172,7 @@ def _split_copies(count: int, file: int, dtype: np.dtype[Any]) -> None:
         for at in range(count, 2 * count, CHUNK):
             rows = np.empty(min(CHUNK, 2 * count - at), dtype)
             read_all(file, rows, at * dtype.itemsize)
-            priority = rows["priority"]
+            priority = priorities_of(rows, seed)
             yield rows, priority == np.append(last, priority[:-1])
             last = priority[-1]
 

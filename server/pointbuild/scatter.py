@@ -8,6 +8,7 @@ on that place.
 from __future__ import annotations
 
 import os
+import tempfile
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -16,7 +17,7 @@ import numpy as np
 from numba import njit
 
 from .extend import OWNER
-from .rows import as_words, fill_rows
+from .rows import as_words, fill_rows, in_chunks, priorities_of
 from .spool import Block, Spool, read_all, write_all
 
 if TYPE_CHECKING:
@@ -52,25 +53,35 @@ class Scattered:
 
 
 class Regions:
-    """The file of all rows: bucket b is the rows ``first[b]`` to ``first[b + 1]``.
+    """All rows: bucket b is the rows ``first[b]`` to ``first[b + 1]``.
+
+    As they are scattered they stand in one file, the last bucket first; as they are sorted in another, the first bucket
+    first. So one is cut off at its end while the other grows.
 
     Parameters
     ----------
     path : Path
-        Is created if it is not there; removing it is the owner's part.
+        Of the first file; both are created if they are not there. Removing them is the owner's part.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.dtype: np.dtype[Any] = np.dtype([])
         self.first = np.zeros(1, np.int64)
-        self._filled = np.zeros(0, np.int64)
-        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        self._places = self._filled = np.zeros(0, np.int64)
+        self._file, self._sorted = (
+            os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600) for file in (path, self._path_of_sorted)
+        )
+
+    @property
+    def _path_of_sorted(self) -> Path:
+        return self.path.with_name(f"{self.path.name}-sorted")
 
     def lay_out(self, dtype: np.dtype[Any], counts: list[int]) -> None:
         """Say what rows are and how many each bucket will have."""
         self.dtype = dtype
         self.first = np.concatenate([[0], np.cumsum(counts)])
+        self._places = self.first[-1] - self.first[1:]
         self._filled = np.zeros(len(counts), np.int64)
 
     def skip(self, counts: NDArray[np.int64]) -> None:
@@ -78,8 +89,8 @@ class Regions:
         self._filled += counts
 
     def reserve(self, counts: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Give the number of the next free row of each bucket, of which `counts` are taken."""
-        places = self.first[:-1] + self._filled
+        """Give the next free place in the file of each bucket, where `counts` rows go."""
+        places = self._places + self._filled
         self.skip(counts)
         return places
 
@@ -88,47 +99,62 @@ class Regions:
         begin = 0
         for bucket in np.flatnonzero(counts):
             end = begin + int(counts[bucket])
-            self.write(int(places[bucket]), sorted_rows[begin:end])
+            write_all(self._file, sorted_rows[begin:end], int(places[bucket]) * self.dtype.itemsize)
             begin = end
 
-    def write(self, row: int, rows: NDArray[Any]) -> None:
-        """Overwrite rows from number `row` on."""
-        write_all(self._file, rows, row * self.dtype.itemsize)
+    def replace(self, row: int, rows: NDArray[Any]) -> None:
+        """Put all rows of a bucket, which begins at number `row`, in another order; any thread may."""
+        write_all(self._sorted, rows, row * self.dtype.itemsize)
 
     @contextmanager
     def rewriting(self, row: int) -> Iterator[int]:
-        """Give a file for rows that are to stand from number `row` on; any thread may.
+        """Do so with a file that they are to be written to."""
+        with tempfile.TemporaryFile(dir=self.path.parent) as file:
+            yield file.fileno()
+            at = 0
+            while piece := os.pread(file.fileno(), _PIECE, at):
+                write_all(self._sorted, np.frombuffer(piece, np.uint8), row * self.dtype.itemsize + at)
+                at += len(piece)
 
-        It stays until `settle` is called or `restore` finds it: no sample is lost if the build is killed meanwhile.
-        """
-        part, whole = (self.path.with_name(f"{self.path.name}-{row}.{state}") for state in ("part", "whole"))
-        file = os.open(part, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
-        try:
-            yield file
-            part.rename(whole)
-            self._copy(file, row * self.dtype.itemsize)
-        finally:
-            os.close(file)
+    def settle(self, bucket: int) -> None:
+        """Give back the room of the scattered rows of buckets up to this one; they cannot be read again."""
+        os.truncate(self._file, int(self._places[bucket]) * self.dtype.itemsize)
 
-    def settle(self, row: int) -> None:
-        """Rows that were replaced will not be asked for again as they were."""
-        self.path.with_name(f"{self.path.name}-{row}.whole").unlink()
+    def read(self, row: int, out: NDArray[Any]) -> None:
+        """Fill `out` with rows from number `row` on, all of one bucket, as they were scattered."""
+        bucket = int(np.searchsorted(self.first, row, side="right")) - 1
+        read_all(self._file, out, int(self._places[bucket] + row - self.first[bucket]) * self.dtype.itemsize)
 
-    def restore(self) -> None:
-        """Finish what `replace` may have begun when the build was killed: the order of the rows may have changed."""
-        for part in self.path.parent.glob(f"{self.path.name}-*.part"):
-            part.unlink()
-        for whole in self.path.parent.glob(f"{self.path.name}-*.whole"):
-            file = os.open(whole, os.O_RDONLY)
-            self._copy(file, int(whole.stem.rpartition("-")[2]) * self.dtype.itemsize)
-            os.close(file)
-            whole.unlink()
+    def chunks(self, row: int, count: int, most: int) -> Iterator[NDArray[Any]]:
+        """Yield `count` rows from number `row` on, all of one bucket, at most `most` at a time."""
+        return in_chunks(self, row, count, most)
 
-    def _copy(self, file: int, offset: int) -> None:
-        at = 0
-        while piece := os.pread(file, _PIECE, at):
-            write_all(self._file, np.frombuffer(piece, np.uint8), offset + at)
-            at += len(piece)
+    def replaced(self) -> SortedRegions:
+        """Give the rows as they were replaced."""
+        return SortedRegions(self, self._sorted)
+
+    def remove(self) -> None:
+        """Remove the files."""
+        self.close()
+        self.path.unlink()
+        self._path_of_sorted.unlink()
+
+    def close(self) -> None:
+        """Close the files; twice is fine."""
+        if self._file >= 0:
+            os.close(self._file)
+            os.close(self._sorted)
+            self._file = -1
+
+
+class SortedRegions:
+    """Rows of `regions` as they were replaced, in the file `sorted_file`."""
+
+    def __init__(self, regions: Regions, sorted_file: int) -> None:
+        self.dtype, self.first = regions.dtype, regions.first
+        self.replace, self.rewriting, self.settle = regions.replace, regions.rewriting, regions.settle
+        self.remove = regions.remove
+        self._file = sorted_file
 
     def read(self, row: int, out: NDArray[Any]) -> None:
         """Fill `out` with rows from number `row` on."""
@@ -136,29 +162,11 @@ class Regions:
 
     def chunks(self, row: int, count: int, most: int) -> Iterator[NDArray[Any]]:
         """Yield `count` rows from number `row` on, at most `most` at a time."""
-        for at in range(row, row + count, most):
-            out = np.empty(min(most, row + count - at), self.dtype)
-            self.read(at, out)
-            yield out
+        return in_chunks(self, row, count, most)
 
-    def replaced(self) -> Regions:
-        """Give the rows after every bucket was replaced: they are at the same place."""
+    def replaced(self) -> SortedRegions:
+        """They are."""
         return self
-
-    def cut(self, bucket: int) -> None:
-        """Give back the room of a bucket and of all after it; they cannot be read again."""
-        os.truncate(self._file, int(self.first[bucket]) * self.dtype.itemsize)
-
-    def remove(self) -> None:
-        """Remove the file."""
-        self.close()
-        self.path.unlink()
-
-    def close(self) -> None:
-        """Close the file; twice is fine."""
-        if self._file >= 0:
-            os.close(self._file)
-            self._file = -1
 
 
 def scatter(
@@ -188,10 +196,10 @@ def scatter(
     """
     values = spool.read(block, ("xyz", OWNER, *(attribute.name for attribute in schema)))
     places = frame.places(values["xyz"])
-    rows = fill_rows(dtype, places, values, schema, seed)
+    rows = fill_rows(dtype, places, values, schema)
     if len(plan.buckets) == 1:
         return Scattered(rows, np.array([block.samples]), Candidates(np.empty(0, np.uint64), np.empty(0, np.int32)))
-    bucket, priority = plan.locate(frame.cells, places), rows["priority"]
+    bucket, priority = plan.locate(frame.cells, places), priorities_of(rows, seed)
     counts = np.bincount(bucket, minlength=len(plan.buckets))
     out = np.empty_like(rows)
     _sort_rows(as_words(rows), bucket, np.cumsum(counts) - counts, as_words(out))
@@ -199,14 +207,14 @@ def scatter(
     return Scattered(out, counts, Candidates(priority[chosen], bucket[chosen]))
 
 
-def gather(regions: Regions, limits: NDArray[np.uint64], chunk: int) -> Candidates:
+def gather(regions: Regions, limits: NDArray[np.uint64], seed: int, chunk: int) -> Candidates:
     """Candidates once more from the rows as they were scattered, `chunk` at a time: the limits were too low."""
     priority, bucket = [np.empty(0, np.uint64)], [np.empty(0, np.int32)]
     for number, limit in enumerate(limits):
         for rows in regions.chunks(int(regions.first[number]), int(np.diff(regions.first)[number]), chunk):
-            chosen = rows["priority"][rows["priority"] <= limit]
-            priority.append(chosen)
-            bucket.append(np.full(len(chosen), number, np.int32))
+            found = priorities_of(rows, seed)
+            priority.append(found[found <= limit])
+            bucket.append(np.full(len(priority[-1]), number, np.int32))
     return Candidates(np.concatenate(priority), np.concatenate(bucket))
 
 

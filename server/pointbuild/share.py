@@ -19,6 +19,9 @@ import numpy as np
 
 from lpc.errors import BuildError
 
+from .rows import in_chunks
+from .spool import write_all
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -143,21 +146,23 @@ class SharedRegions:
 
     def chunks(self, row: int, count: int, most: int) -> Iterator[NDArray[Any]]:
         """Yield `count` rows from number `row` on, at most `most` at a time."""
-        for at in range(row, row + count, most):
-            out = np.empty(min(most, row + count - at), self.dtype)
-            self.read(at, out)
-            yield out
+        return in_chunks(self, row, count, most)
+
+    def replace(self, row: int, rows: NDArray[Any]) -> None:
+        """Put all rows of a bucket, which begins at number `row`, in another order."""
+        with self.rewriting(row) as file:
+            write_all(file, rows, 0)
 
     @contextmanager
     def rewriting(self, row: int) -> Iterator[int]:
-        """Give a file for the sorted rows of the bucket that begins at number `row`."""
+        """Do so with a file that they are to be written to."""
         with tempfile.TemporaryFile() as file:
             yield file.fileno()
             self.share.put(f"sorted-{self._bucket(row)}", file)
 
-    def settle(self, row: int) -> None:
-        """Remove the rows as they were scattered."""
-        self.share.remove(f"scattered-{self._bucket(row)}")
+    def settle(self, bucket: int) -> None:
+        """Remove the rows of a bucket as they were scattered."""
+        self.share.remove(f"scattered-{bucket}")
 
     def _bucket(self, row: int) -> int:
         return int(np.searchsorted(self.first, row, side="right")) - 1

@@ -126,6 +126,19 @@ def test_only_the_last_ancestors_count() -> None:
     assert_same(last, clouds[-1])
 
 
+@settings(max_examples=30)
+@given(families())
+def test_fast_takes_no_context_and_flips_nothing(family: list[RawCloud]) -> None:
+    frames = encode_line(family, effort="fast")
+    assert frames == encode_line(family, effort="fast", engine="numpy")
+    for frame, raw in zip(frames, family, strict=True):
+        axes, prediction = payload_of(frame)[1], payload_of(frame)[PREDICTION_AT]
+        assert axes < 4
+        assert prediction != CONTEXT
+        alone = decode_cloud(frame, samples=len(raw), schema=raw.schema)
+        assert rows(alone.lattice(), dict(alone.codes)) == rows(raw.lattice, raw.codes)
+
+
 def test_ancestors_elsewhere_are_no_context() -> None:
     near, far = sphere(300, 1), sphere(300, 2)
     moved = RawCloud(lattice=far.lattice + 10_000, codes=far.codes, schema=far.schema)

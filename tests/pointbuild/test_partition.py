@@ -17,7 +17,7 @@ from support.built import Built, build_points, numbered
 from lpc.lattice import quantise
 from lpc.points import PointBatch
 from pointbuild.priority import priorities
-from pointbuild.rows import fill_rows, row_dtype
+from pointbuild.rows import fill_rows, priorities_of, row_dtype
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -35,7 +35,7 @@ def placed(
     dtype = row_dtype(header.attributes, short=places.max() < 2**31)
     values = {"place": np.arange(len(xyz), dtype=np.uint32)}
     low, high = xyz.min(axis=0), xyz.max(axis=0)
-    priority = fill_rows(dtype, places, values, header.attributes, seed)["priority"]
+    priority = priorities_of(fill_rows(dtype, places, values, header.attributes), seed)
     return places, (low - np.array(header.origin)) / header.step, (high - low) / header.step, priority
 
 

@@ -60,6 +60,19 @@ def test_requests_are_short_but_hold_one_object() -> None:
     assert spans(scheduler.issue(0.0, ADSL)) == [(0, 5_000_000, (0,))]
 
 
+def test_what_comes_along_is_nearly_as_urgent() -> None:
+    """Neighbours in the file whose turn would come much later wait for it: the line carries urgent bytes first."""
+    near = [(k, k * 4000, k * 4000 + 4000) for k in range(3)]
+    between = [(k, k * 100_000, k * 100_000 + 20_000) for k in range(10, 13)]  # 0.38 s of the line
+    for reach, keys in ((0.25, (0,)), (0.5, (0, 1, 2))):
+        scheduler = Scheduler(SchedulerOptions(reach_seconds=reach))
+        offer(scheduler, [near[0], *between, *near[1:]])
+        assert spans(scheduler.issue(0.0, ADSL))[0][2] == keys
+    scheduler = Scheduler()
+    offer(scheduler, [near[0], *between, *near[1:]])
+    assert spans(scheduler.issue(0.0, None))[0][2] == (0, 1, 2)  # a file: nothing waits
+
+
 def test_what_is_not_issued_is_forgotten() -> None:
     scheduler = Scheduler()
     offer(scheduler, [(k, k * 100_000, k * 100_000 + 5000) for k in range(50)])

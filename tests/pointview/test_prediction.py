@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -199,3 +200,52 @@ def test_what_the_next_views_lack_comes_nearest_first_and_once():
     assert len(looked) == 1
     lookahead.note(5 * FRAME, orbit(4 * FRAME))
     assert len(lookahead.nodes(look)) == 0
+
+
+NOTHING = SimpleNamespace(asks=np.empty(0, dtype=np.int64))
+
+
+def swinging(t: float, period: float) -> Camera:
+    """An orbit whose sense changes every so many seconds."""
+    angle = 0.8 * (period - abs(t % (2 * period) - period))
+    return Camera(
+        eye=(3 * math.cos(angle), 3 * math.sin(angle), 1), target=(0, 0, 0), up=(0, 0, 1), width=64, height=48
+    )
+
+
+@pytest.mark.parametrize(("period", "trusted"), [(1e9, 4), (1.0, 1), (0.4, 0)])
+def test_a_motion_that_turns_round_is_foreseen_for_as_long_as_it_goes_on(period, trusted):
+    """The horizons that are looked at, 0.25 to 2 s, are those that most predictions held over."""
+    lookahead, looked = Lookahead(LookaheadOptions(enough=10**9)), []
+
+    def look(camera: Camera) -> object:
+        looked.append(camera)
+        return NOTHING
+
+    counts = []
+    for frame in range(int(20 / FRAME)):
+        t = frame * FRAME
+        lookahead.note(t, swinging(t, period))
+        looked.clear()
+        lookahead.nodes(look)
+        if t > 10:
+            counts.append(len(looked))
+    assert np.median(counts) == trusted
+
+
+def test_a_rest_does_not_take_trust_away():
+    lookahead, looked = Lookahead(LookaheadOptions(enough=10**9)), []
+
+    def look(camera: Camera) -> object:
+        looked.append(camera)
+        return NOTHING
+
+    moved = 0.0
+    for frame in range(int(20 / FRAME)):
+        t = frame * FRAME
+        moved += FRAME * (t % 3.0 < 1.0)
+        lookahead.note(t, swinging(moved, 1e9))
+        if t % 3.0 < 0.9 and t > 15.3:
+            looked.clear()
+            lookahead.nodes(look)
+            assert len(looked) == 4

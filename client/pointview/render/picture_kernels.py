@@ -283,3 +283,79 @@ def count_cells(
                     counts[row, 0] += 1
                     row = place.lower
                 level += 1
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def contrast_by_cell(
+    sums: NDArray[np.float64],
+    rgb: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    places: NDArray[Any],
+    halvings: NDArray[Any],
+    eye: NDArray[np.float32],
+    rotation: NDArray[np.float32],
+    focal: float,
+    reach: float,
+    stride: int,
+) -> None:  # pragma: no cover - compiled
+    """Add the squared difference of covered pixels from others near them to the halves of the cells that they show.
+
+    Parameters
+    ----------
+    sums : (n, 2) float64
+        For the lower and the upper half of the cell of each node of `places`.
+    rgb : (h, w, 3) uint8
+    depth : (h, w) float32
+    eye : (3,) float32
+        Relative to the corner of the root's cell.
+    reach : float
+        How far the others are, over the spacing that the pixel shows; a pixel at least.
+    stride : int
+        Pixels and lines from one that is looked at to the next.
+    """
+    height, width = depth.shape
+    rows, halves = np.empty(len(halvings) + 1, np.int64), np.empty(len(halvings) + 1, np.int64)
+    inverse = F(1.0 / focal)
+    for line in range(0, height, stride):
+        up = (F(0.5) * F(height) - F(line) - F(0.5)) * inverse
+        for column in range(0, width, stride):
+            here = depth[line, column]
+            if here == np.inf:
+                continue
+            right = (F(column) + F(0.5) - F(0.5) * F(width)) * inverse
+            x = eye[0] + here * (rotation[0, 0] * right + rotation[1, 0] * up + rotation[2, 0])
+            y = eye[1] + here * (rotation[0, 1] * right + rotation[1, 1] * up + rotation[2, 1])
+            z = eye[2] + here * (rotation[0, 2] * right + rotation[1, 2] * up + rotation[2, 2])
+            row, level, spacing = 0, 0, F(0.0)
+            while row >= 0:
+                axis, half, place = halvings[level].axis, halvings[level].half, places[row]
+                along = x if axis == 0 else (y if axis == 1 else z)
+                rows[level] = row
+                if along >= half:
+                    halves[level] = 1
+                    row, spacing = place.upper, place.upper_spacing
+                    if axis == 0:
+                        x -= half
+                    elif axis == 1:
+                        y -= half
+                    else:
+                        z -= half
+                else:
+                    halves[level] = 0
+                    row, spacing = place.lower, place.lower_spacing
+                level += 1
+            # The sign of a spacing says whether a node is missing.
+            away = max(int(F(reach * focal) * abs(spacing) / here + F(0.5)), 1)
+            total, count = 0, 0
+            for direction in range(4):
+                step = away if direction < 2 else -away
+                i, j = (line + step, column) if direction % 2 else (line, column + step)
+                if 0 <= i < height and 0 <= j < width:
+                    count += 1
+                    for channel in range(3):
+                        difference = int(rgb[i, j, channel]) - int(rgb[line, column, channel])
+                        total += difference * difference
+            if count:
+                mean = total / count
+                for k in range(level):
+                    sums[rows[k], halves[k]] += mean

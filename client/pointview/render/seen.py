@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from pointview.camera import Camera
     from pointview.refine import Cut
 
+    from .backend import Frame
+
 
 def place_table(cut: Cut) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return a cut's places as the kernels read them: of the nodes, and the halvings of the levels."""
@@ -63,3 +65,30 @@ def pixels_by_cell(depth: NDArray[np.float32], cut: Cut, camera: Camera, *, stri
             counts, looked, places, halvings, eye, camera.rotation().astype(np.float32), camera.focal / stride
         )
     return counts[: len(cut.nodes)]
+
+
+def contrast_by_cell(frame: Frame, cut: Cut, camera: Camera, *, reach: float, stride: int = 1) -> NDArray[np.float64]:
+    """Sum up how much the pixels in each half of the cell of each node of a cut differ from others near them.
+
+    Parameters
+    ----------
+    frame : Frame
+        The picture of that cut.
+    reach : float
+        How far the others are, over the spacing that the pixel shows; a pixel at least.
+    stride : int
+        Look at every so many pixels of every so many lines; the sums are of the whole picture all the same.
+
+    Returns
+    -------
+    (n, 2) float64
+        Mean squared difference from four others, summed over channels, in squared levels, and over pixels.
+    """
+    places, halvings = place_table(cut)
+    sums = np.zeros((max(len(places), len(cut.nodes)), 2))
+    if cut.places is not None and len(places):
+        eye, turn = (np.array(camera.eye) - cut.places.corner[0]).astype(np.float32), camera.rotation()
+        picture_kernels.contrast_by_cell(
+            sums, frame.rgb, frame.depth, places, halvings, eye, turn.astype(np.float32), camera.focal, reach, stride
+        )
+    return np.asarray(sums[: len(cut.nodes)] * stride**2)

@@ -21,6 +21,7 @@ from pointview.lookahead import Lookahead
 from pointview.occlusion import KEPT, Occlusion
 from pointview.refine import Cut, Priority, SplatRule, refine
 from pointview.render import Kind, Style, open_backend
+from pointview.urgency import Contrast
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 Clock = Callable[[], float]
 
 TEST_EVERY = 6
-"""Frames from one test of what is hidden to the next."""
+"""Frames from one look at what the picture shows to the next."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -238,6 +239,7 @@ class _Session:
         self.recording = Recording()
         self.lookahead = Lookahead()
         self.occlusion: Occlusion | None = None
+        self.contrast: Contrast | None = None
         self.tested: tuple[object, ...] = ()
         self.steady = 0
 
@@ -305,6 +307,10 @@ class _Session:
             self.occlusion = None
         elif self.occlusion is None or len(self.occlusion.hidden) != nodes:
             self.occlusion = Occlusion(nodes)
+        if options.priority != "error" or options.splat_rule != "place":
+            self.contrast = None
+        elif self.contrast is None or len(self.contrast.shown) != nodes:
+            self.contrast = Contrast(nodes)
         return refine(
             layer.index,
             camera,
@@ -314,16 +320,18 @@ class _Session:
             splat_rule=options.splat_rule,
             cull_backfaces=not options.style.two_sided,
             hidden=None if self.occlusion is None else self.occlusion.hidden,
+            contrast=None if self.contrast is None else self.contrast.shown,
         )
 
     def _is_test_due(self, cut: Cut, camera: Camera) -> bool:
-        """Tell whether the picture should be asked for what is hidden: every few frames, if anything changed."""
-        if self.occlusion is None or self.recording.frames % TEST_EVERY:
+        """Tell whether the picture should be asked for what it shows: every few frames, if anything changed."""
+        asks = self.occlusion is not None or (self.contrast is not None and len(cut.wants) > 0)
+        if not asks or self.recording.frames % TEST_EVERY:
             return False
         state = (cut.nodes.tobytes(), camera)
         self.steady = self.steady + 1 if state == self.tested else 0
         self.tested = state
-        return self.steady <= KEPT
+        return self.steady <= (0 if self.occlusion is None else KEPT)
 
     async def _draw(self, backend: Backend, cut: Cut, camera: Camera) -> tuple[Cut, Frame]:
         """Draw a cut, and once more with what it shows to be visible after all (LPC 4: the third pass)."""
@@ -332,7 +340,11 @@ class _Session:
         for last in (False, True):
             clouds = {node: layer.take(node) for node in cut.nodes.tolist()}
             frame = await drawer(self.drawer, partial(backend.draw, cut, clouds.__getitem__, camera, style))
-            if self.occlusion is None or layer.index is not index:
+            if layer.index is not index:
+                break
+            if self.contrast is not None:
+                self.contrast.look(index, cut, camera, frame)
+            if self.occlusion is None:
                 break
             seen = self.occlusion.look(index, cut, camera, frame)
             if last or not seen:

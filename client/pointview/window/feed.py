@@ -71,6 +71,7 @@ class View:
     tolerance: float
     cull_backfaces: bool
     hidden: NDArray[np.bool_] | None
+    contrast: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,6 +231,8 @@ class Feed:
                 layer.resident,
                 cull_backfaces=view.cull_backfaces,
                 hidden=view.hidden,
+                priority="error",
+                contrast=view.contrast,
             )
 
         moves = now - self._moved_at < REST

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 from pointview.colouring import Colouring, available_modes
 from pointview.render import Kind, open_backend
 from pointview.render.picture import tint_starved
-from pointview.render.seen import pixels_by_cell
+from pointview.render.seen import contrast_by_cell, pixels_by_cell
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -84,7 +84,9 @@ class Painter:
         self._thread.shutdown()
 
     def _try(self, cut: Cut, mirror: Mirror, camera: Camera, settings: Settings) -> None:
-        pixels_by_cell(self._draw(cut, mirror, camera, settings).depth, cut, camera)
+        frame = self._draw(cut, mirror, camera, settings)
+        pixels_by_cell(frame.depth, cut, camera)
+        contrast_by_cell(frame, cut, camera, reach=1.0)
 
     def _draw(self, cut: Cut, mirror: Mirror, camera: Camera, settings: Settings) -> Frame:
         backend, colouring = self._prepared(mirror, settings)

@@ -45,7 +45,16 @@ class Quality:
         """Start at a tolerance in pixels."""
         return cls(moving=Feedback(tolerance=tolerance), resting=Feedback(tolerance=tolerance))
 
-    def cut(self, mirror: Mirror, camera: Camera, settings: Settings, hidden: Hidden, *, moving: bool) -> Cut:
+    def cut(
+        self,
+        mirror: Mirror,
+        camera: Camera,
+        settings: Settings,
+        hidden: Hidden,
+        contrast: NDArray[np.float64] | None = None,
+        *,
+        moving: bool,
+    ) -> Cut:
         """Compute the cut of a frame."""
         assert mirror.index is not None
         tolerance = settings.tolerance
@@ -53,12 +62,13 @@ class Quality:
         if settings.steady:
             tolerance = max(tolerance, (self.moving if moving else self.resting).tolerance)
         self.tolerance = tolerance
+        order: dict[str, Any] = {"priority": "error", "contrast": contrast}
         if not settings.limited:
-            return refine(mirror.index, camera, tolerance, mirror.resident, **options)
+            return refine(mirror.index, camera, tolerance, mirror.resident, **options, **order)
         index = mirror.index
         within = allowance(index, camera, settings.budget, index.known, at_least=tolerance, **options)
         self.tolerance = within.tolerance
-        return refine_within(index, camera, within, mirror.resident, **options)
+        return refine_within(index, camera, within, mirror.resident, **options, **order)
 
     def took(self, seconds: float, settings: Settings, *, moving: bool) -> bool:
         """Take in what a frame took; True if a camera at rest should be drawn again, with another tolerance."""

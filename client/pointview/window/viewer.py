@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pointview.camera import Camera
+from pointview.urgency import Contrast
 
 from .commands import obey
 from .controls import Viewpoint, vertical_of
-from .culling import Culling
+from .culling import STRIDE, Culling
 from .feed import View
 from .inputs import Inputs, Scene, moved
 from .mirror import Mirror
@@ -35,6 +36,9 @@ if TYPE_CHECKING:
 
 REST = 0.25
 """Seconds without motion after which the camera rests and the picture may take longer."""
+
+CONTRAST_EVERY = 0.2
+"""Seconds between two looks at where the picture is most wrong."""
 
 SHARE_EVERY = 0.5
 """Seconds between two looks at how much of the view is here."""
@@ -91,6 +95,7 @@ class Viewer:
         self.mirror = Mirror()
         self.quality = Quality.at(settings.tolerance)
         self.culling = Culling(clock)
+        self.contrast: Contrast | None = None
         self.view: Viewpoint | None = None
         self.cut: Cut | None = None
         self.frame: Frame | None = None
@@ -102,7 +107,7 @@ class Viewer:
         self.longest_handover = 0.0
         self.closing = False
         self._drawn: tuple[object, ...] = ()
-        self._moved_at = self._share_at = self._turned_at = self._told_at = -1e9
+        self._moved_at = self._share_at = self._turned_at = self._told_at = self._contrast_at = -1e9
         self._redraw = False
         self._errors: dict[str, int] = {}
 
@@ -110,7 +115,7 @@ class Viewer:
         """Show another model in place of the present one."""
         self._close_feed()
         self.mirror, self.view, self.cut, self.frame, self.scene = Mirror(), None, None, None, None
-        self.message, self.loaded, self._errors = "", (0, 0), {}
+        self.message, self._told_at, self.loaded, self._errors = "", -1e9, (0, 0), {}
         self.settings.up, self.settings.help = None, False
         self.feed = self._open_feed(target)
 
@@ -163,14 +168,14 @@ class Viewer:
     def advance(self, did: Inputs) -> NDArray[np.uint8] | None:
         """Take in a frame's input and what came; return the new picture, or None if it is the same."""
         now = self._clock()
-        if now - self._told_at > NOTICE and not self.mirror.failure:
+        if now - self._told_at > NOTICE:
             self.message = ""
         obey(self, did)
         if self.feed is None:
             return None
         news = self.mirror.take_in(self.feed.news())
-        if self.mirror.failure:
-            self.message = self.mirror.failure
+        if self.mirror.failure and now - self._told_at > NOTICE:
+            self.message = self.mirror.failure  # what was told since comes first
         self._hear(self.feed)
         if self.mirror.index is None:
             return None
@@ -214,6 +219,7 @@ class Viewer:
             self.cut = self._refined(camera, moving=moving)  # with what shows up (LPC 4: the third pass)
             self.frame = self.painter.draw(self.cut, self.mirror, camera, self.settings)
         seconds = self.drawing = self._clock() - start
+        self._look_at_contrast(camera)
         # What compiles or uploads says nothing about the next frame.
         settled = not first and self.frame.uploads * 4 <= self.frame.clouds
         self._redraw = settled and self.quality.took(seconds, self.settings, moving=moving)
@@ -221,17 +227,33 @@ class Viewer:
         self.scene = _seen(self.scene, self.frame, camera)
         return shown(self.frame, self.settings)
 
+    def _look_at_contrast(self, camera: Camera) -> None:
+        """Ask the picture where it is most wrong, now and then while something is missing."""
+        now = self._clock()
+        if self.contrast is None or self.cut is None or self.frame is None or self.mirror.index is None:
+            return
+        if len(self.cut.wants) and now - self._contrast_at > CONTRAST_EVERY:
+            self._contrast_at = now
+            look = partial(self.contrast.look, self.mirror.index, self.cut, camera, self.frame, stride=STRIDE)
+            self.painter.run(look)
+
     def _refined(self, camera: Camera, *, moving: bool) -> Cut:
         """Compute the cut of a frame, and ask for what it wants."""
         assert self.feed is not None
         assert self.mirror.index is not None
         self.culling.prepare(self.mirror.index, wanted=self.settings.occlusion)
-        cut = self.quality.cut(self.mirror, camera, self.settings, self.culling.hidden, moving=moving)
+        nodes = self.mirror.index.header.nodes
+        if self.contrast is None or len(self.contrast.shown) != nodes:
+            self.contrast = Contrast(nodes)
+        cut = self.quality.cut(
+            self.mirror, camera, self.settings, self.culling.hidden, self.contrast.shown, moving=moving
+        )
         view = View(
             camera=camera,
             tolerance=self.quality.tolerance,
             cull_backfaces=not self.settings.two_sided,
             hidden=self.culling.hidden,
+            contrast=self.contrast.shown,
         )
         self.feed.ask(self.mirror.build, cut.asks, cut.nodes, view)
         return cut
