@@ -109,7 +109,7 @@ def places(
     drawn, missing : (n, 2) bool
         For each node, which children are drawn and which are missing.
     own, shown : (n,) float64
-        Each node's own spacing and the largest shown around its samples.
+        The spacing that each node's own samples close (`snug`), and the largest shown around its samples.
     below : Below
         What the index says of the halves without a drawn node.
     alone : (n,) float64

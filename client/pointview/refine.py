@@ -10,8 +10,8 @@ array of node numbers and every test below is one numpy expression over it.
    sphere nearest to the eye; infinite where the eye is inside. Below the tolerance the node is fine enough.
 3. Otherwise its children refine it: one whose record is unknown makes its page wanted; one that is not resident is
    wanted itself; one that is resident is visited. A node with a visible child that cannot be drawn yet is *starved*.
-4. Splats show the spacing of the deepest drawn node at their place (`places`): no holes where data is missing, and no
-   fat beside it. LPC's plain rule, one size a cloud, is there for comparison.
+4. Splats show the spacing of the deepest drawn node at their place (`places`), or less where that does (`snug`): no
+   holes where data is missing, and no fat beside it. LPC's plain rule, one size a cloud, is there for comparison.
 
 Nothing here does I/O or reads a clock; equal arguments give equal cuts.
 """
@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .places import Places, places
+from .snug import snug
 from .splats import CLOSING, LARGEST
 from .uneven import look_below
 from .urgency import removed_per_byte
@@ -273,6 +274,7 @@ def refine(
         spacing = np.where(ends, own, np.minimum(coarseness * (tolerance / spacing_px), own))
         laid_out = None
     else:
+        own = own * snug(index, nodes, spacing_px)
         below = look_below(index, camera, nodes, drawn, missing)
         spacing = _shown_spacing(starts, drawn, np.where(ends, own, 0.0), below.spacing[: len(nodes)])
         alone = np.sqrt(index.density.own[nodes])

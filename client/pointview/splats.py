@@ -25,9 +25,10 @@ ROUND = 2.0 / math.sqrt(math.pi)
 ROUND_FROM = 1.0
 """Splats with a side above this many pixels are discs; below, a splat is the pixel that its sample falls into."""
 
-BULGE = 0.5
+BULGE = 2.0
 """How far behind its centre the rim of a disc is, over its radius. Decides which is seen; the depth of a picture
-stays that of the disc."""
+stays that of the disc. More than the depth that a surface gains over a radius, so that where surfaces lie close behind
+one another the one whose samples are there is seen; and less than the thickness of what has a far side."""
 
 STEEPEST = 0.15
 """Least cosine between a disc's normal and the direction to the eye: one seen from the side would cover nothing."""

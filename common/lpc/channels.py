@@ -155,7 +155,8 @@ def rows_of(members: Sequence[tuple[Cloud, NDArray[np.intp]]], schema: Schema) -
                     part.append(column.take(index))
             values = [np.concatenate(part) for part in parts]
             rows += values if attribute.kind == "normal" else [*_ycocg(np.stack(values, axis=1), attribute.bits)]
-    return np.array(rows).astype(np.uint32)
+    samples = sum(len(index) for _, index in members)
+    return np.array(rows).astype(np.uint32).reshape(len(rows), samples)  # there may be no row, or no sample
 
 
 def from_channels(rows: NDArray[np.uint32], schema: Schema) -> dict[str, NDArray[Any]]:

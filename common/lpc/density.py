@@ -44,6 +44,10 @@ class Density:
         Spacing that a picture shows where it ends at the node, model units: r_j, or in an uneven cell the root of the
         mean square over its area, as far as the index is known.
     uneven : (nodes,) bool
+    area : (nodes,) float64
+        Of the surface that the samples in the cell are spread over, model units squared.
+    contrast : (nodes,) float64
+        Root mean square of R over that area, over R_j: 1 where the scan is even, or nothing below is known.
     """
 
     def __init__(self, nodes: int) -> None:
@@ -52,8 +56,9 @@ class Density:
         self.own = np.zeros(nodes)
         self.coarseness = np.zeros(nodes)
         self.uneven = np.zeros(nodes, bool)
+        self.area = np.zeros(nodes)
+        self.contrast = np.zeros(nodes)
         self._inside = np.zeros(nodes)  # T_j
-        self._area = np.zeros(nodes)
         self._square = np.zeros(nodes)  # area times mean square of R over it
 
     def add(self, index: IndexTree, levels: Sequence[NDArray[np.int64]]) -> None:
@@ -74,9 +79,10 @@ class Density:
         self._inside[nodes], self.drawn[nodes] = inside, count / inside
         self.own[nodes] = index.samples[nodes] / inside
         self.full[nodes] = index.spacing[nodes] * np.sqrt(count / inside)
-        self._area[nodes] = index.spacing[nodes] ** 2 * count
-        self._square[nodes] = self._area[nodes] * self.full[nodes] ** 2
+        self.area[nodes] = index.spacing[nodes] ** 2 * count
+        self._square[nodes] = self.area[nodes] * self.full[nodes] ** 2
         self.coarseness[nodes] = index.spacing[nodes]
+        self.contrast[nodes] = 1.0
 
     def _add_up(self, index: IndexTree, changed: NDArray[np.int64]) -> NDArray[np.int64]:
         """Tell parents about their children, where all of these are known; return them."""
@@ -87,10 +93,11 @@ class Density:
         whole = (index.known[children] & (self._inside[children] > 0) | ~exists).all(axis=1)
         parents, children, exists = parents[whole], children[whole], exists[whole]
         square = np.where(exists, self._square[children], 0.0).sum(axis=1)
-        area = np.where(exists, self._area[children], 0.0).sum(axis=1)
+        area = np.where(exists, self.area[children], 0.0).sum(axis=1)
         mean = np.sqrt(square / np.where(area > 0, area, 1.0))
-        self._square[parents] = mean**2 * self._area[parents]
-        self.uneven[parents] = mean > EVEN * self.full[parents]
+        self._square[parents] = mean**2 * self.area[parents]
+        self.contrast[parents] = mean / self.full[parents]
+        self.uneven[parents] = self.contrast[parents] > EVEN
         shown = np.maximum(mean / np.sqrt(self.drawn[parents]), index.spacing[parents])
         self.coarseness[parents] = np.where(self.uneven[parents], shown, index.spacing[parents])
         return parents

@@ -56,6 +56,8 @@ def test_shares_and_coarseness_by_recursion(fading):
     inside, area, square = np.array([values for _, values in sorted(slow(index).items())]).T
     np.testing.assert_allclose(density.drawn, 1 - (index.subtree - index.samples) / inside, rtol=1e-9)
     np.testing.assert_allclose(density.full, np.sqrt(area / inside), rtol=1e-9)
+    np.testing.assert_allclose(density.area, area, rtol=1e-9)
+    np.testing.assert_allclose(density.contrast, np.sqrt(square) / density.full, rtol=1e-9)
     leaf = (index.children < 0).all(axis=1)
     np.testing.assert_allclose(density.full[leaf], index.spacing[leaf])
     uneven = np.sqrt(square) > EVEN * density.full
@@ -77,7 +79,7 @@ def test_pages_may_come_in_any_order(fading):
         while not index.page_loaded.all():
             page = int(rng.choice(np.flatnonzero(~index.page_loaded & (index.page_offset > 0))))
             index.add_page(page, fading[int(index.page_offset[page]) :])
-        for name in ("full", "drawn", "coarseness", "uneven"):
+        for name in ("full", "drawn", "coarseness", "uneven", "area", "contrast"):
             np.testing.assert_allclose(getattr(index.density, name), getattr(whole, name), rtol=1e-12)
 
 

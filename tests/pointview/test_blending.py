@@ -43,7 +43,7 @@ def lit(albedo, normal, inside):
 
 def samples_of(model, cut, camera):
     """What the oracle blends: (center, plane's normal, side of the splat, lit levels), camera space."""
-    walk, found = placed.Walk(model, cut), []
+    walk, found = placed.Walk(model, cut, camera), []
     for number in cut.nodes.tolist():
         xyz, codes = model.positions(number), model.clouds[number].codes
         inside, (_, depth) = camera.to_camera(xyz), camera.project(xyz)

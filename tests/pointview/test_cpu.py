@@ -31,7 +31,7 @@ def paint(model, cut, camera, *, cull, splat):
     column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     ray = np.stack([(column - camera.width / 2), (camera.height / 2 - row)], axis=-1) / camera.focal
     ray = np.concatenate([ray, np.ones((*depth.shape, 1))], axis=-1)
-    walk = placed.Walk(model, cut)
+    walk = placed.Walk(model, cut, camera)
     for number in cut.nodes.tolist():
         xyz = model.positions(number)
         pixel, z = camera.project(xyz)
@@ -271,7 +271,7 @@ def test_starved_pixels_are_tinted(tmp_path):
     cut = refine(model.index, camera, 1.0, model.first(6))
     frame = CpuBackend(model.header).draw(cut, model.take, camera, Style())
     where = frame.starved
-    walk = placed.Walk(model, cut)
+    walk = placed.Walk(model, cut, camera)
     one_way = {node: found[1] for node in cut.nodes.tolist() if (found := walk.deepest_everywhere(node))}
     known = np.isin(frame.node, list(one_way))
     np.testing.assert_array_equal(where[known], [one_way[node] for node in frame.node[known].tolist()])

@@ -102,7 +102,7 @@ def test_a_fine_picture_is_tried_although_a_coarse_one_hid_nothing():
             if viewer.occlusion.verdict is not None:
                 break
         assert viewer.occlusion.verdict is not None
-        fine = refine(model.index, camera, 2.0, model.everything)
+        fine = refine(model.index, camera, 2.0, model.everything, cull_backfaces=False)
         viewer.occlusion.look(model.index, fine, camera, backend.draw(fine, model.take, camera, STYLE))
         assert (viewer.occlusion.verdict is None) == (tolerance == 9.0)
 

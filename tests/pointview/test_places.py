@@ -135,7 +135,7 @@ def test_thin_parts_of_a_cell_grow_where_nothing_of_them_is_here(fading, nodes):
             if child not in rows:
                 break
             node, path = child, [*path, half]
-        spacing, drawn, cell = index.spacing[node], node, node
+        spacing, drawn, cell = index.spacing[node] * placed.share(index, node, CAMERA), node, node
         while density.uneven[cell] and (child := int(index.children[cell][half])) >= 0:
             cell, path = child, [*path, half]
             spacing = density.full[cell] / np.sqrt(density.drawn[drawn])

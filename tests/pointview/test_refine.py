@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support import models
+from support import models, placed
 
 from pointview.camera import Camera
 from pointview.refine import FEW, Cut, refine
@@ -56,7 +56,7 @@ def recursion(model, camera, tolerance, resident, known, cull_backfaces):
         return math.inf if gap <= 0 else index.spacing[node] * camera.focal / gap
 
     def visit(node):
-        own = index.spacing[node]
+        own = index.spacing[node] * placed.share(index, node, camera)
         if pixels(node) < tolerance or (index.children[node] < 0).all():
             drawn[node] = (False, own)
             return own
@@ -181,7 +181,7 @@ def test_projected_spacing_by_hand(ball):
     gap = math.dist(index.center[0], camera.eye) - index.radius[0]
     expected = index.spacing[0] * 400 / (2 * math.tan(math.radians(22.5))) / gap
     assert cut.max_spacing_px == pytest.approx(expected)
-    assert cut.splat_px[0] == pytest.approx(CLOSING * expected)
+    assert cut.splat_px[0] == pytest.approx(CLOSING * expected * placed.share(index, 0, camera))
 
 
 def test_an_eye_inside_a_sphere_refines_it(ball):
@@ -215,7 +215,7 @@ def test_a_starved_node_is_grown_and_its_refined_sibling_is_not(ring):
     shown = dict(zip(cut.nodes.tolist(), cut.spacing.tolist(), strict=True))
     fine = dict(zip(full.nodes.tolist(), full.spacing.tolist(), strict=True))
     assert cut.nodes[cut.starved].tolist() == [1]
-    assert shown[1] == pytest.approx(ring.index.spacing[1], rel=1e-6)
+    assert shown[1] == pytest.approx(ring.index.spacing[1] * placed.share(ring.index, 1, camera), rel=1e-6)
     assert shown[0] == shown[1] > fine[0]  # the root's samples lie in the starved region too
     assert shown[2] == fine[2]
 

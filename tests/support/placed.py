@@ -2,11 +2,29 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from pointview import splats
+from pointview import snug, splats
 from pointview.render.pack import Packer
 from pointview.render.tables import STEPS
+
+
+def share(index, node, camera):
+    """Share of a splat's size that does where a node is the deepest (`pointview.snug`), a number at a time."""
+
+    def ramp(value, start, stop):
+        return min(max((value - start) / (stop - start), 0.0), 1.0)
+
+    gap = math.dist(index.center[node], camera.eye) - index.radius[node]
+    spacing_px = index.density.coarseness[node] * camera.focal / gap if gap > 0 else math.inf
+    if spacing_px <= snug.FINE:
+        return 1.0
+    folds = ramp(index.density.area[node] / (math.pi * index.radius[node] ** 2), snug.FLAT, snug.FOLDED)
+    family = [node, *([index.parent[node]] if node else [])]
+    falls = max(ramp(index.density.contrast[one], snug.EVEN, snug.FALLING) for one in family)
+    return max(snug.SNUG + (1 - snug.SNUG) * max(folds, falls), snug.FINE / spacing_px)
 
 
 def cell_of(header, path):
@@ -32,8 +50,8 @@ def path_of(index, node):
 class Walk:
     """Looks spacings up in one cut."""
 
-    def __init__(self, model, cut):
-        self.index, self.header, self.model = model.index, model.header, model
+    def __init__(self, model, cut, camera):
+        self.index, self.header, self.model, self.camera = model.index, model.header, model, camera
         self.spacing = dict(zip(cut.nodes.tolist(), cut.spacing.tolist(), strict=True))
         self.wants = set(cut.wants.tolist())
 
@@ -41,7 +59,7 @@ class Walk:
         """What half a cell without a drawn node shows: spacing, starved."""
         child = int(self.index.children[node][half])
         if child in self.wants:
-            return float(self.index.spacing[node]), True
+            return float(self.index.spacing[node]) * share(self.index, node, self.camera), True
         return self.spacing[node], False
 
     def coarsest(self, node, half):

@@ -175,7 +175,7 @@ class GlBackend:
             "size": (camera.width, camera.height),
             "margin": self._margin,
             "focal": camera.focal,
-            "range": (near, 2 * far),  # the rim of a disc is behind its centre
+            "range": (near, (1 + 2 * splats.BULGE) * far),  # the rim of a disc is behind its centre
             "largest": self._largest,
             "round_from": self._largest if style.splat == "square" else splats.ROUND_FROM,
             "round_factor": splats.ROUND,

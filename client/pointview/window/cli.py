@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from lpc.errors import NotFound
-from pointstream.arguments import COUNT, POSITIVE
+from pointstream.arguments import COUNT, POSITIVE, Number
 from pointstream.cli import CACHE, choose_cache
 from pointview.arguments import TOLERANCE, SizeType, ViewType, read_link
 from pointview.cli import MOST_THREADS
@@ -23,6 +23,12 @@ from pointview.cli import MOST_THREADS
 @click.option("--view", type=ViewType(), help="Where to look from first; without it the whole model is framed.")
 @TOLERANCE
 @click.option("--budget", type=COUNT, help="Most splats.")
+@click.option(
+    "--frame-time",
+    type=Number(min=0),
+    metavar="SECONDS",
+    help="Draw coarser where a frame takes longer; 0: however long it takes.",
+)
 @click.option("--backend", type=click.Choice(["auto", "gl", "cpu"]), default="auto", show_default=True)
 @click.option("--link", metavar="none|adsl|lan|RATE[,RTT]", help="See the model as over this line.")
 @click.option(
@@ -40,6 +46,7 @@ def view(
     view: dict[str, Any] | None,
     tolerance: float,
     budget: int | None,
+    frame_time: float | None,
     backend: Any,
     link: str | None,
     folder: Path,
@@ -58,6 +65,9 @@ def view(
     settings = Settings(tolerance=tolerance, help=model is None)
     if budget is not None:
         settings.budget, settings.limited = budget, True
+    if frame_time is not None:
+        settings.steady = frame_time > 0
+        settings.frame_seconds = frame_time or settings.frame_seconds
     options = ViewerOptions(backend=backend, threads=min(os.cpu_count() or 1, MOST_THREADS), folder=folder, view=view)
 
     def open_feed(target: str) -> Feed:
