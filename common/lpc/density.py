@@ -96,7 +96,8 @@ class Density:
         area = np.where(exists, self.area[children], 0.0).sum(axis=1)
         mean = np.sqrt(square / np.where(area > 0, area, 1.0))
         self._square[parents] = mean**2 * self.area[parents]
-        self.contrast[parents] = mean / self.full[parents]
+        full = self.full[parents]  # 0: all samples of the cell coincide
+        self.contrast[parents] = np.divide(mean, full, out=np.ones(len(parents)), where=full > 0)
         self.uneven[parents] = self.contrast[parents] > EVEN
         shown = np.maximum(mean / np.sqrt(self.drawn[parents]), index.spacing[parents])
         self.coarseness[parents] = np.where(self.uneven[parents], shown, index.spacing[parents])
