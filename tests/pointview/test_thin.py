@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from lpc.octahedral import encode_normals
+from pointview.render import thin as module
 from pointview.render.tables import STEPS
-from pointview.render.thin import FEWEST, thin
+from pointview.render.thin import FEWEST, LARGEST_GRID, thin
 
 SIDE = 60_000
 
@@ -66,3 +67,13 @@ def test_few_samples_say_nothing():
     assert not thin(position, code_of((0, -0.6, 0.8), len(position))).any()
     same = np.full((100, 3), 7, dtype=np.uint16)
     assert not thin(same, code_of((0, 0, 1), 100)).any()
+
+
+def test_grids_of_a_dense_clump_with_strays_stay_small(monkeypatch):
+    rng = np.random.default_rng(5)
+    position = rng.integers(30_000, 30_100, (2000, 3)).astype(np.uint16)
+    position[:4] = rng.integers(0, 65_536, (4, 3))
+    shapes, shape = [], module._shape
+    monkeypatch.setattr(module, "_shape", lambda *box: shapes.append(shape(*box)) or shapes[-1])
+    assert not thin(position, code_of((0, 0, 1), len(position))).any()
+    assert np.max(shapes) <= LARGEST_GRID + 3

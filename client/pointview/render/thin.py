@@ -72,14 +72,15 @@ def thin(position: NDArray[np.uint16], normal: NDArray[np.uint16]) -> NDArray[np
     low = position.min(axis=0).astype(np.float64)
     extent = (position.max(axis=0) - low + 1.0).tolist()
     area = max(extent[0] * extent[1], extent[1] * extent[2], extent[2] * extent[0])
-    side = CELL * math.sqrt(area / len(position))
+    least = max(extent) / LARGEST_GRID
+    better = max(CELL * math.sqrt(area / len(position)), least)
     for _ in range(TRIES):
-        side = max(side, max(extent) / LARGEST_GRID)
+        side = better
         company = _company(position, low, 1.0 / side, _shape(extent, side))
         median = float(np.median(company))
-        if USUAL / 1.5 <= median <= USUAL * 1.5:
+        better = max(side * math.sqrt(USUAL / median), least)
+        if USUAL / 1.5 <= median <= USUAL * 1.5 or better == side:
             break
-        side *= math.sqrt(USUAL / median)
     usual = 3.0 * side / math.sqrt(median)
     pending = np.flatnonzero((company > 0) & (company < COMPANY) & (normal != 0))
     if not len(pending):
