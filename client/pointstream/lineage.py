@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import TYPE_CHECKING
 
-from lpc.context import ANCESTORS, has_context
+from lpc.context import has_context, line_of
 from lpc.errors import Corrupt
 
 if TYPE_CHECKING:
@@ -19,13 +19,8 @@ Family = dict[int, "Cloud | Corrupt"]
 
 
 def ancestors(index: IndexTree, node: int) -> list[int]:
-    """Nodes that a cloud is guessed from, from the root down, as far as pages say."""
-    if not has_context(index.header.attributes):
-        return []
-    line = [node]
-    while len(line) <= ANCESTORS and line[-1] > 0 and index.linked[line[-1]]:
-        line.append(int(index.parent[line[-1]]))
-    return line[:0:-1]
+    """Nodes that a cloud is guessed from, from the root down; none where no page says which they are."""
+    return line_of(node, index.parent) if index.linked[node] and has_context(index.header.attributes) else []
 
 
 def context(index: IndexTree, node: int, family: Mapping[int, Cloud | Corrupt]) -> list[Cloud]:
@@ -36,10 +31,10 @@ def context(index: IndexTree, node: int, family: Mapping[int, Cloud | Corrupt]) 
     Corrupt
         If one of them is damaged, or a page that says which they are: `Untold`.
     """
-    clouds, line = [], ancestors(index, node)
-    if has_context(index.header.attributes) and len(line) < ANCESTORS and (line or [node])[0] > 0:
+    if has_context(index.header.attributes) and not index.linked[node]:
         raise Untold(f"cloud {node}: the page that says what it is told from is not here")
-    for above in line:
+    clouds = []
+    for above in ancestors(index, node):
         cloud = family[above]
         if isinstance(cloud, Corrupt):
             raise Untold(f"cloud {node}: it is told from one that is damaged ({cloud})")

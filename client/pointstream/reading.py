@@ -354,7 +354,8 @@ class Reader:
             place, tries = self.index.cloud_range(node), self.options.tries
             while isinstance(family[node], Corrupt):
                 if isinstance(family[node], Untold):
-                    if any(isinstance(family[above], Corrupt) for above in ancestors(self.index, node)):
+                    above = ancestors(self.index, node)
+                    if not above or any(isinstance(family[each], Corrupt) for each in above):
                         break
                 else:
                     tries -= 1

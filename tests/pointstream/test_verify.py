@@ -217,6 +217,24 @@ def test_a_damaged_page_hides_its_clouds_and_the_rest_is_checked(model: bytes) -
     assert "cannot be found behind 1 damaged page" in report.problems[1]
 
 
+def test_clouds_whose_ancestors_a_damaged_page_hides_are_told_of(model: bytes) -> None:
+    header = parse_header(model)
+    index = IndexTree(header)
+    for page in range(header.pages):
+        place = index.page_range(page)
+        index.add_page(page, model[place.start : place.stop])
+    damaged = bytearray(model)
+    damaged[index.page_range(1).start + 50] ^= 1
+    nodes = list(range(header.page_nodes, 2 * header.page_nodes))
+    behind = np.setdiff1d(subtrees(index, nodes), nodes)
+    report = check(bytes(damaged))
+    hidden = header.nodes - report.clouds_checked
+    assert f"{hidden} of {header.nodes} clouds cannot be found behind 1 damaged page" in report.problems[1]
+    untold = len(behind) - (hidden - len(nodes))
+    assert untold > 0
+    assert report.problems[2].startswith(f"{untold} sound clouds of ")
+
+
 def test_lies_under_right_checksums_are_found(model: bytes) -> None:
     def shrink(records: Any, clouds: Any) -> None:
         records["radius"][0] *= 0.9
