@@ -82,7 +82,7 @@ def thin(position: NDArray[np.uint16], normal: NDArray[np.uint16]) -> NDArray[np
         if USUAL / 1.5 <= median <= USUAL * 1.5 or better == side:
             break
     usual = 3.0 * side / math.sqrt(median)
-    pending = np.flatnonzero((company > 0) & (company < COMPANY) & (normal != 0))
+    pending = np.flatnonzero((company < COMPANY) & (normal != 0))
     if not len(pending):
         return codes
     apart, around = np.zeros(len(pending)), np.full((len(pending), 4), -1)
@@ -116,20 +116,17 @@ def _shape(extent: list[float], side: float) -> tuple[int, int, int]:
 def _company(
     position: NDArray[np.uint16], low: NDArray[np.float64], inverse: float, shape: tuple[int, int, int]
 ) -> NDArray[np.int32]:  # pragma: no cover - compiled
-    """Count the samples in the 27 cells around each sample; 0 for those outside the box."""
+    """Count the samples in the 27 cells around each sample."""
     nx, ny, nz = shape
     count = np.zeros(nx * ny * nz, np.int32)
     cell = np.empty(len(position), np.int32)
     for i in range(len(position)):
         cell[i] = _cell(position[i], low, inverse, shape)
-        if cell[i] >= 0:
-            count[cell[i]] += 1
+        count[cell[i]] += 1
     around = np.full(len(count), -1, np.int32)
     company = np.zeros(len(position), np.int32)
     for i in range(len(position)):
         at = cell[i]
-        if at < 0:
-            continue
         if around[at] < 0:
             total = np.int32(0)
             for u in range(-1, 2):
@@ -145,12 +142,10 @@ def _company(
 def _cell(
     place: NDArray[np.uint16], low: NDArray[np.float64], inverse: float, shape: tuple[int, int, int]
 ) -> int:  # pragma: no cover - compiled
-    """Cell of a sample, never an outermost one; -1 for one outside the box."""
+    """Cell of a sample, never an outermost one."""
     a = math.floor((place[0] - low[0]) * inverse) + 1
     b = math.floor((place[1] - low[1]) * inverse) + 1
     c = math.floor((place[2] - low[2]) * inverse) + 1
-    if a < 1 or a > shape[0] - 2 or b < 1 or b > shape[1] - 2 or c < 1 or c > shape[2] - 2:
-        return -1
     return (a * shape[1] + b) * shape[2] + c
 
 
@@ -178,20 +173,18 @@ def _apart(
     cell = np.empty(len(position), np.int32)
     for i in range(len(position)):
         cell[i] = _cell(position[i], low, inverse, shape)
-        if cell[i] >= 0:
-            start[cell[i] + 1] += 1
+        start[cell[i] + 1] += 1
     for at in range(1, len(start)):
         start[at] += start[at - 1]
-    order, filled = np.empty(start[-1], np.int32), start[:-1].copy()
+    order, filled = np.empty(len(position), np.int32), start[:-1].copy()
     highest = np.zeros(3)
     lowest = np.full(3, 65536.0)
     for i in range(len(position)):
-        if cell[i] >= 0:
-            order[filled[cell[i]]] = i
-            filled[cell[i]] += 1
-            for axis in range(3):
-                highest[axis] = max(highest[axis], position[i, axis])
-                lowest[axis] = min(lowest[axis], position[i, axis])
+        order[filled[cell[i]]] = i
+        filled[cell[i]] += 1
+        for axis in range(3):
+            highest[axis] = max(highest[axis], position[i, axis])
+            lowest[axis] = min(lowest[axis], position[i, axis])
     side = 1.0 / inverse
     apart = np.zeros(len(pending))
     nearest, around = np.empty(4), np.full((len(pending), 4), -1, np.int64)
