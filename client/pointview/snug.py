@@ -45,4 +45,4 @@ def snug(index: IndexTree, nodes: NDArray[np.int64], spacing_px: NDArray[np.floa
     folds = density.area[nodes] / (np.pi * np.maximum(index.radius[nodes], 1e-300) ** 2)
     falls = np.maximum(density.contrast[nodes], density.contrast[np.maximum(index.parent[nodes], 0)])
     lone = np.maximum(np.interp(folds, [FLAT, FOLDED], [0.0, 1.0]), np.interp(falls, [EVEN, FALLING], [0.0, 1.0]))
-    return np.maximum(SNUG + (1.0 - SNUG) * lone, np.minimum(FINE / np.maximum(spacing_px, FINE), 1.0))
+    return np.maximum(SNUG + (1.0 - SNUG) * lone, FINE / np.maximum(spacing_px, FINE))
