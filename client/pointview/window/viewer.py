@@ -115,6 +115,7 @@ class Viewer:
         """Show another model in place of the present one."""
         self._close_feed()
         self.mirror, self.view, self.cut, self.frame, self.scene = Mirror(), None, None, None, None
+        self.contrast = None
         self.message, self._told_at, self.loaded, self._errors = "", -1e9, (0, 0), {}
         self.settings.up, self.settings.help = None, False
         self.feed = self._open_feed(target)
