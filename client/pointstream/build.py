@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from lpc.context import ANCESTORS, has_context
+from lpc.context import ANCESTORS, is_told
 from lpc.ranges import ByteRange
 
 from .lineage import ancestors
@@ -171,7 +171,7 @@ class Build:
 
     def _with_ancestors(self, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
         """Put before nodes those that are not here and without which they cannot be decoded."""
-        if not has_context(self.index.header.attributes):
+        if not is_told(self.index.header):
             return nodes
         resident, parent = self.residency.resident, self.index.parent
         line, rank = nodes[self.index.linked[nodes]], np.flatnonzero(self.index.linked[nodes])
@@ -193,7 +193,7 @@ class Build:
 
     def _bereave(self, nodes: NDArray[np.int64]) -> None:
         """Mark nodes as absent, in their order, whose parents are: nothing tells their clouds."""
-        if not has_context(self.index.header.attributes):
+        if not is_told(self.index.header):
             return
         nodes = nodes[self.index.known[nodes] & self.index.linked[nodes] & (nodes > 0)]
         while len(lost := nodes[self.absent[self.index.parent[nodes]] & ~self.absent[nodes]]):

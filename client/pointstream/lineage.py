@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from typing import TYPE_CHECKING
 
-from lpc.context import has_context, line_of
+from lpc.context import is_told, line_of
 from lpc.errors import Corrupt
 
 if TYPE_CHECKING:
@@ -20,18 +20,20 @@ Family = dict[int, "Cloud | Corrupt"]
 
 def ancestors(index: IndexTree, node: int) -> list[int]:
     """Nodes that a cloud is guessed from, from the root down; none where no page says which they are."""
-    return line_of(node, index.parent) if index.linked[node] and has_context(index.header.attributes) else []
+    return line_of(node, index.parent) if is_told(index.header) and index.linked[node] else []
 
 
-def context(index: IndexTree, node: int, family: Mapping[int, Cloud | Corrupt]) -> list[Cloud]:
-    """Give the decoded ancestors of a node.
+def context(index: IndexTree, node: int, family: Mapping[int, Cloud | Corrupt]) -> list[Cloud] | None:
+    """Give the decoded ancestors of a node; None where no cloud of the model is guessed from any.
 
     Raises
     ------
     Corrupt
         If one of them is damaged, or a page that says which they are: `Untold`.
     """
-    if has_context(index.header.attributes) and not index.linked[node]:
+    if not is_told(index.header):
+        return None
+    if not index.linked[node]:
         raise Untold(f"cloud {node}: the page that says what it is told from is not here")
     clouds = []
     for above in ancestors(index, node):

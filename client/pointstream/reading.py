@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lpc.context import has_context
+from lpc.context import is_told
 from lpc.errors import Corrupt, ModelChanged
 from lpc.page import page_bytes
 from lpc.ranges import ByteRange, coalesce
@@ -187,7 +187,7 @@ class Reader:
             if region.spacing is None or int(index.page_loaded.sum()) == loaded:
                 break  # pages of uneven cells tell how coarse the nodes above them are
         nodes = nodes[self._there(nodes)]
-        if self.store.partial and has_context(index.header.attributes):  # nor what is told from those
+        if self.store.partial and is_told(index.header):  # nor what is told from those
             here = np.zeros(len(index), dtype=bool)
             here[nodes] = True
             while not (told := here[index.parent[nodes]] | (nodes == 0)).all():

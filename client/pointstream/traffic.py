@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lpc.context import has_context, line_of
+from lpc.context import is_told
 from lpc.errors import Corrupt, FormatError, LpcError, ModelChanged, StoreError, Unavailable
 from lpc.header import HEADER_PROBE
 from lpc.ranges import ByteRange
@@ -20,6 +20,7 @@ from .arrivals import Assembly
 from .build import Arrived, Build
 from .decoding import Decoder
 from .foresight import Foresight
+from .lineage import ancestors
 from .offers import Item, Request
 from .opening import Opening, add_page, hole_at, naming, vouch_opening
 from .recovery import Recovery
@@ -122,7 +123,7 @@ class Traffic:
         keys, starts, stops, held = build.places(pages, nodes)
         self.local.offer(keys[held], starts[held], stops[held])
         line = 0  # the first want may wait for its ancestors: what these bring along would delay it
-        while line + 1 < len(nodes) and nodes[line] in line_of(int(nodes[line + 1]), build.index.parent):
+        while line + 1 < len(nodes) and nodes[line] in ancestors(build.index, int(nodes[line + 1])):
             line += 1
         alone = nodes[: line + 1] if line else None
         self.scheduler.offer(keys[~held], starts[~held], stops[~held], alone=alone)
@@ -369,7 +370,7 @@ class Traffic:
 
     def _damaged(self, build: Build, key: int, error: FormatError) -> None:
         if build.failed(key, self._options.tries):
-            below = key >= 0 and has_context(build.index.header.attributes) and (build.index.children[key] >= 0).any()
+            below = key >= 0 and is_told(build.index.header) and (build.index.children[key] >= 0).any()
             what = "it stays missing, and what is below it" if below else "it stays missing"
             self.errors.add("page" if key < 0 else "cloud", f"{self.store.name}: {error}; {what}")
             self.wanted.came(self._clock(), key)

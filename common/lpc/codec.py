@@ -285,7 +285,7 @@ def _frame(packed: Packed, channels: Channels, compressor: zstandard.ZstdCompres
 
 
 def decode_cloud(
-    frame: bytes, *, samples: int, schema: Schema, context: Sequence[Cloud] = (), engine: Engine = "auto"
+    frame: bytes, *, samples: int, schema: Schema, context: Sequence[Cloud] | None = (), engine: Engine = "auto"
 ) -> Cloud:
     """Unpack a cloud.
 
@@ -297,8 +297,9 @@ def decode_cloud(
         How many samples the node's record promises.
     schema : Schema
         The header's attributes.
-    context : sequence of Cloud
-        The node's ancestors, decoded, from the root down: the last `ANCESTORS` of them, or all there are.
+    context : sequence of Cloud, optional
+        The node's ancestors, decoded, from the root down: the last `ANCESTORS` of them, or all there are. None: the
+        model is one of which no cloud is guessed from any (`is_told`).
     engine : {"auto", "numpy", "compiled"}
         "auto" takes the compiled kernels if numba is installed. The arrays are the same.
 
@@ -317,6 +318,8 @@ def decode_cloud(
     if unpacked.largest >> (3 * layout.nbits):
         raise Corrupt(f"cloud: its positions leave {layout.nbits} bits")
     if layout.turn == CONTEXT:
+        if context is None:
+            raise Corrupt("cloud: it is guessed from others, and the header says that none is")
         near = select(
             context,
             schema,

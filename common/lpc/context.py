@@ -20,11 +20,14 @@ if TYPE_CHECKING:
 
     from .attributes import Schema
     from .cloud import Cloud
+    from .header import Header
 
 Place = tuple[int, int, int]
 
 ANCESTORS = 4
 """Of those further up hardly any sample is near."""
+FAST = "fast"
+"""The effort of a writer that takes no context."""
 
 
 def has_context(schema: Schema) -> bool:
@@ -34,7 +37,13 @@ def has_context(schema: Schema) -> bool:
 
 def takes_context(schema: Schema, effort: str) -> bool:
     """Whether our writer tells them so: not where it has to be fast."""
-    return effort != "fast" and has_context(schema)
+    return effort != FAST and has_context(schema)
+
+
+def is_told(header: Header) -> bool:
+    """Whether clouds of a model may be told so: none is where `packing` says that it was built fast."""
+    packing = header.extra.get("packing")
+    return has_context(header.attributes) and not (isinstance(packing, dict) and packing.get("effort") == FAST)
 
 
 def line_of(number: int, parent: Sequence[int] | NDArray[Any]) -> list[int]:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lpc.codec import decode_cloud, samples_to_points
-from lpc.context import ANCESTORS, line_of, takes_context
+from lpc.context import ANCESTORS, is_told, line_of
 from lpc.errors import BuildError, FormatError
 from lpc.header import HEADER_PROBE, PART_SUFFIX, parse_header
 from lpc.index import IndexTree
@@ -195,9 +195,7 @@ class OldModel:
 
     def line(self, node: int) -> list[int]:
         """Nodes that tell a cloud, from the root down."""
-        header = self.header
-        told = takes_context(header.attributes, header.extra[PACKING]["effort"])
-        return line_of(node, self.index.parent) if told else []
+        return line_of(node, self.index.parent) if is_told(self.header) else []
 
     def frame(self, file: int, node: int) -> bytes:
         """Bytes of a cloud, checked."""

@@ -135,8 +135,14 @@ def test_fast_takes_no_context_and_flips_nothing(family: list[RawCloud]) -> None
         axes, prediction = payload_of(frame)[1], payload_of(frame)[PREDICTION_AT]
         assert axes < 4
         assert prediction != CONTEXT
-        alone = decode_cloud(frame, samples=len(raw), schema=raw.schema)
+        alone = decode_cloud(frame, samples=len(raw), schema=raw.schema, context=None)
         assert rows(alone.lattice(), dict(alone.codes)) == rows(raw.lattice, raw.codes)
+
+
+def test_a_context_where_the_header_promises_none_is_corrupt() -> None:
+    family = [sphere(300, seed) for seed in range(2)]
+    with pytest.raises(Corrupt, match="the header says that none is"):
+        decode_cloud(encode_line(family)[1], samples=300, schema=family[0].schema, context=None)
 
 
 def test_ancestors_elsewhere_are_no_context() -> None:

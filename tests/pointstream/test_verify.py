@@ -203,6 +203,19 @@ def test_every_damaged_cloud_is_named(model: bytes) -> None:
     assert "the header says 20000" in report.problems[4]
 
 
+def test_a_damaged_cloud_of_a_fast_model_takes_no_other_with_it(scan: PointBatch, tmp_path: Path) -> None:
+    options = BuildOptions(threads=1, cloud_size=256, effort="fast")
+    build_model([ArrayScan(scan)], tmp_path / "m.lpc", options, clock=time.monotonic)
+    data = bytearray((tmp_path / "m.lpc").read_bytes())
+    index = whole_index(bytes(data))
+    data[index.offset[1] + 15] ^= 2
+    report = check(bytes(data))
+    left = len(scan) - int(index.samples[1])
+    assert len(report.problems) == 2
+    assert report.problems[0].startswith("cloud 1: checksum differs")
+    assert report.problems[1].startswith(f"the clouds hold {left} samples")
+
+
 def test_a_damaged_page_hides_its_clouds_and_the_rest_is_checked(model: bytes) -> None:
     header = parse_header(model)
     index = IndexTree(header)
