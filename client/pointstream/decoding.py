@@ -62,6 +62,7 @@ class Decoder:
         self.seconds = 0.0
         self._clock = clock
         self._threads = ThreadPoolExecutor(threads, thread_name_prefix="decode")
+        self._closed = False
 
     def decode(
         self,
@@ -72,7 +73,12 @@ class Decoder:
         family: Mapping[int, Cloud | Corrupt],
         done: Callable[[Cloud | Corrupt], None],
     ) -> None:
-        """Decode a cloud; `done` is called on the running loop, later, with it or with what is wrong with it."""
+        """Decode a cloud; `done` is called on the running loop, later, with it or with what is wrong with it.
+
+        Nothing is done any more once this is closed: what was being decoded then may be what others waited for.
+        """
+        if self._closed:
+            return
         self.backlog += len(data)
         self.pending += 1
         work = asyncio.get_running_loop().run_in_executor(self._threads, self._timed, data, node, index, family)
@@ -80,6 +86,7 @@ class Decoder:
 
     def close(self) -> None:
         """Drop what waits, finish what is being decoded."""
+        self._closed = True
         self._threads.shutdown(cancel_futures=True)
 
     def _timed(

@@ -70,6 +70,12 @@ def test_a_file_cut_short_costs_what_is_left(model_file, tmp_path, capsys):
     assert left["bytes"] <= 150_000 + 20_000
 
 
+def test_clouds_that_wait_for_others_when_it_is_done_are_let_go(model_file, capsys, caplog):
+    """Opening fetches clouds that no estimate needs, and some are being decoded when it closes the model."""
+    estimate(capsys, model_file, "--link", "adsl")
+    assert not [record for record in caplog.records if record.name == "asyncio"]
+
+
 def test_a_wrong_link_is_a_wrong_argument(model_file, capsys):
     assert command(["estimate", str(model_file), "--link", "fast"]) == 2
     assert "--link" in capsys.readouterr().err
