@@ -87,7 +87,7 @@ class SchedulerOptions:
     """
 
     request_seconds: float = 0.1
-    reach_seconds: float = 0.75
+    reach_seconds: float = 1.5
     smallest_request: int = 8192
     largest_request: int = 1 << 19
     overhead: int = 400
