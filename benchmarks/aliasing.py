@@ -23,6 +23,7 @@ from PIL import Image
 from support import traced
 
 from lpc.codec import decode_cloud
+from lpc.context import line_of
 from lpc.header import parse_header
 from lpc.index import IndexTree
 from lpc.points import PointBatch
@@ -222,11 +223,18 @@ class Model:
             where = self.index.page_range(page)
             self.index.add_page(page, data[where.start : where.stop])
         self._data = data
+        self._clouds: dict[int, Any] = {}
 
     def take(self, node: int) -> Any:
-        where = self.index.cloud_range(node)
-        data = self._data[where.start : where.stop]
-        return decode_cloud(data, samples=int(self.index.samples[node]), schema=self.header.attributes)
+        if node not in self._clouds:
+            where = self.index.cloud_range(node)
+            self._clouds[node] = decode_cloud(
+                self._data[where.start : where.stop],
+                samples=int(self.index.samples[node]),
+                schema=self.header.attributes,
+                context=[self.take(above) for above in line_of(node, self.index.parent)],
+            )
+        return self._clouds[node]
 
     def camera(self, size: int, shift: tuple[float, float]) -> Camera:
         """A camera that sees the model in 80% of its picture, shifted by some pixels."""
