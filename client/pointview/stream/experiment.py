@@ -14,10 +14,12 @@ import numpy as np
 from pointstream.layer import AccessLayer, LayerOptions
 from pointstream.stores import open_store
 from pointview.camera import Camera
+from pointview.occlusion import Occlusion
 from pointview.refine import Priority, SplatRule, refine
 from pointview.render import Frame, Style, open_backend
 from pointview.settle import settle
 from pointview.still import CAPACITY
+from pointview.urgency import Contrast
 
 from . import network
 from .metrics import psnr_db, ssim
@@ -170,6 +172,9 @@ async def _references(experiment: Experiment, times: Sequence[float]) -> tuple[l
                 look = partial(_look, camera=camera, tolerance=experiment.tolerance)
                 cut = await settle(layer, look, clock=time.monotonic)
                 frames.append(backend.draw(cut, layer.take, camera, style))
+                # A session looks at its pictures: the kernels of that are to be loaded as well.
+                Contrast(layer.header.nodes).look(layer.index, cut, camera, frames[-1])
+                Occlusion(layer.header.nodes).look(layer.index, cut, camera, frames[-1])
             return frames, [_line(error) for error in layer.stats.errors]
         finally:
             backend.close()
